@@ -1,0 +1,62 @@
+"""Geometry of boxes (x, y, z, length, width, height, yaw) in LiDAR axes: x forward, y left, z up, metres.
+
+z is the height of the box's centre; yaw turns about +z, is 0 along +x and lies in [-pi, pi).
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def limit_angle(angle: Tensor) -> Tensor:
+    """Wraps angles in radians to [-pi, pi)."""
+    wrapped = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+    # remainder of a tiny negative number rounds up to the modulus itself
+    return torch.where(wrapped >= math.pi, wrapped - 2 * math.pi, wrapped)
+
+
+def bev_corners(boxes: Tensor) -> Tensor:
+    """Corners of boxes (..., 7) in bird's eye view: (..., 4, 2), front-left, front-right, rear-right, rear-left."""
+    along = boxes.new_tensor([0.5, 0.5, -0.5, -0.5]) * boxes[..., 3:4]
+    across = boxes.new_tensor([0.5, -0.5, -0.5, 0.5]) * boxes[..., 4:5]
+    cos, sin = boxes[..., 6:7].cos(), boxes[..., 6:7].sin()
+    x = boxes[..., 0:1] + along * cos - across * sin
+    y = boxes[..., 1:2] + along * sin + across * cos
+    return torch.stack((x, y), dim=-1)
+
+
+def box_corners(boxes: Tensor) -> Tensor:
+    """Corners of boxes (..., 7) in 3D: (..., 8, 3), the four of `bev_corners` at the bottom, then at the top."""
+    bev = bev_corners(boxes)
+    half = boxes[..., 5:6] / 2
+    corners = []
+    for z in (boxes[..., 2:3] - half, boxes[..., 2:3] + half):
+        corners.append(torch.cat((bev, z.unsqueeze(-2).expand(*bev.shape[:-1], 1)), dim=-1))
+    return torch.cat(corners, dim=-2)
+
+
+def points_in_boxes(points: Tensor, boxes: Tensor) -> Tensor:
+    """Which of the points (N, 3 or more) lie in or on which of the boxes (M, 7): bool (N, M)."""
+    offset = points[:, None, :3] - boxes[None, :, :3]  # (N, M, 3)
+    cos, sin = boxes[:, 6].cos(), boxes[:, 6].sin()
+    along = offset[..., 0] * cos + offset[..., 1] * sin
+    across = offset[..., 1] * cos - offset[..., 0] * sin
+    inside = (along.abs() * 2 <= boxes[:, 3]) & (across.abs() * 2 <= boxes[:, 4])
+    return inside & (offset[..., 2].abs() * 2 <= boxes[:, 5])
+
+
+def boxes_collide(a: Tensor, b: Tensor) -> Tensor:
+    """Whether boxes a (A, 7) and b (B, 7) overlap in bird's eye view: bool (A, B); touching does not count.
+
+    Separating axes: two rectangles are apart iff their projections on one of the four edge directions are.
+    """
+    corners_a, corners_b = bev_corners(a), bev_corners(b)
+    apart = torch.zeros(len(a), len(b), dtype=torch.bool, device=a.device)
+    yaws = (a[:, 6, None].expand(-1, len(b)), b[None, :, 6].expand(len(a), -1))
+    for yaw in yaws:
+        for axis in (torch.stack((yaw.cos(), yaw.sin()), -1), torch.stack((-yaw.sin(), yaw.cos()), -1)):  # (A, B, 2)
+            on_a = torch.einsum("akd,abd->abk", corners_a, axis)
+            on_b = torch.einsum("bkd,abd->abk", corners_b, axis)
+            apart |= (on_a.amax(-1) <= on_b.amin(-1)) | (on_b.amax(-1) <= on_a.amin(-1))
+    return ~apart
