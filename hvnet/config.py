@@ -1,0 +1,301 @@
+"""The configuration: a tree of frozen dataclasses, read from YAML. Unknown keys, wrong types and impossible values
+are refused with the dotted key. Defaults are the paper's (Sec. 4.1), see configs/hvnet.yaml."""
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from hvnet.cli import InputError
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """Hybrid voxel feature extraction: the scales S_T and S_R are multiples of the voxel size."""
+
+    point_range: tuple[float, float, float, float, float, float] = (0.0, -32.0, -3.0, 64.0, 32.0, 2.0)
+    voxel_size: tuple[float, float] = (0.2, 0.2)  # v_L, v_W in metres
+    feature_scales: tuple[float, ...] = (0.5, 1.0, 2.0)  # S_T
+    projection_scales: tuple[float, ...] = (1.0, 2.0, 4.0)  # S_R, each twice the one before
+    feature_channels: int = 64  # q
+    image_channels: int = 128  # N_H
+    attention_relu: bool = False  # a ReLU before the product of the AVFE layers
+
+
+@dataclass(frozen=True)
+class BackboneConfig:
+    """Main stream and FFPN: one width and one number of layers a block."""
+
+    widths: tuple[int, ...] = (64, 128, 256)
+    layers: tuple[int, ...] = (3, 5, 5)
+    fusion_channels: int = 128  # of each Psi and of each pyramid level
+
+
+@dataclass(frozen=True)
+class ClassConfig:
+    """One class: its anchors, its matching thresholds, its focal loss and its NMS."""
+
+    name: str
+    level: int  # pyramid level: 0 at the finest projection grid, each next one half of it
+    anchor_sizes: tuple[tuple[float, float, float], ...]  # length, width, height in metres
+    anchor_z: float  # height of the anchors' centres in metres
+    positive_iou: float
+    negative_iou: float
+    focal_alpha: float
+    focal_gamma: float
+    nms_iou: float
+
+
+@dataclass(frozen=True)
+class HeadConfig:
+    """Detection heads, and what `detect` reports."""
+
+    classes: tuple[ClassConfig, ...]
+    direction: bool = False  # the two-bin heading branch
+    score_threshold: float = 0.2
+    candidates: int = 1000  # best-scored anchors of a class that go into NMS
+    detections: int = 100  # most boxes a class reports
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the total loss (the paper's lambdas; the direction branch has SECOND's 0.2)."""
+
+    localization: float = 1.0
+    classification: float = 1.0
+    vertical: float = 1.5
+    direction: float = 0.2
+
+
+@dataclass(frozen=True)
+class AugmentConfig:
+    """Augmentation of the training frames."""
+
+    flip: float = 0.5  # probability
+    rotation: float = math.pi / 2  # uniform in [-rotation, rotation], radians
+    scaling: tuple[float, float] = (0.95, 1.05)
+    translation: tuple[float, float, float] = (0.2, 0.2, 0.2)  # standard deviations in metres
+    objects: dict[str, int] = field(default_factory=dict)  # objects of a class after ground-truth sampling
+
+
+@dataclass(frozen=True)
+class SyntheticConfig:
+    """Generated scenes: made when no data folder is given."""
+
+    train_frames: int
+    val_frames: int
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Optimisation, validation and what is written."""
+
+    epochs: int = 70
+    batch_size: int = 4
+    learning_rate: float = 2e-4
+    weight_decay: float = 1e-4
+    warmup_steps: int = 300
+    warmup_ratio: float = 1 / 3
+    decay_epochs: tuple[int, ...] = (40, 60)
+    decay_ratio: float = 0.1
+    gradient_clip: float = 10.0  # largest norm of the gradient
+    validate_every: int = 10  # epochs; the last epoch is always validated
+    pictures: int = 4  # validation frames drawn
+    workers: int = 0  # processes that read and augment
+    bfloat16: bool = False  # backbone and heads in bfloat16; the encoder stays in float32
+    train_split: str = "train"
+    val_split: str = "val"
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that a run depends on but its data."""
+
+    head: HeadConfig
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    backbone: BackboneConfig = field(default_factory=BackboneConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+    synthetic: SyntheticConfig | None = None
+
+
+def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
+    """Reads a YAML file and applies overrides such as "train.epochs=3". Raises InputError naming file and key."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); give an existing YAML file") from error
+    try:
+        tree = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: is no valid YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(tree, dict):
+        raise InputError(f"{path}: want a mapping with the keys {', '.join(_keys(Config))}")
+    for override in overrides:
+        _override(tree, override)
+    return config_from_dict(tree, str(path))
+
+
+def config_from_dict(tree: dict[str, Any], source: str) -> Config:
+    """Builds a Config from plain data (a YAML file, a checkpoint); source names it in errors."""
+    config = _build(Config, tree, "", source)
+    _check(config, source)
+    return config
+
+
+def config_to_dict(config: Config) -> dict[str, Any]:
+    """The resolved config as plain dicts, lists, numbers and strings."""
+    return _plain(dataclasses.asdict(config))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return value
+
+
+def _override(tree: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    if not equals or not key:
+        raise InputError(f"--set {override}: want KEY=VALUE, such as train.epochs=3")
+    *parents, last = key.split(".")
+    node = tree
+    for parent in parents:
+        node = node.setdefault(parent, {})
+        if not isinstance(node, dict):
+            raise InputError(f"--set {override}: {parent} is no group of keys")
+    try:
+        node[last] = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise InputError(f"--set {override}: {text!r} is no valid YAML value") from error
+
+
+def _keys(kind: Any) -> list[str]:
+    return [entry.name for entry in dataclasses.fields(kind)]
+
+
+def _build(kind: Any, value: Any, key: str, source: str) -> Any:
+    """The value as the annotated type, or an InputError with the dotted key."""
+
+    def wrong(wanted: str) -> InputError:
+        return InputError(f"{source}: {key}: want {wanted}, got {value!r} ({type(value).__name__})")
+
+    if dataclasses.is_dataclass(kind):
+        if not isinstance(value, dict):
+            raise wrong(f"a mapping with the keys {', '.join(_keys(kind))}")
+        unknown = [str(name) for name in value if name not in _keys(kind)]
+        if unknown:
+            where = f"{key}.{unknown[0]}" if key else unknown[0]
+            raise InputError(f"{source}: {where}: unknown key; known here: {', '.join(_keys(kind))}")
+        hints = typing.get_type_hints(kind)
+        made = {}
+        for entry in dataclasses.fields(kind):
+            where = f"{key}.{entry.name}" if key else entry.name
+            if entry.name in value:
+                made[entry.name] = _build(hints[entry.name], value[entry.name], where, source)
+            elif entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING:
+                raise InputError(f"{source}: {where}: missing; it has no default")
+        return kind(**made)
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if origin is types.UnionType:
+        return None if value is None else _build(inner[0], value, key, source)
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise wrong("a list")
+        if inner[-1] is Ellipsis:
+            return tuple(_build(inner[0], item, f"{key}[{k}]", source) for k, item in enumerate(value))
+        if len(value) != len(inner):
+            raise wrong(f"a list of {len(inner)}")
+        return tuple(_build(t, item, f"{key}[{k}]", source) for k, (t, item) in enumerate(zip(inner, value, strict=True)))
+    if origin is dict:
+        if not isinstance(value, dict):
+            raise wrong("a mapping")
+        return {
+            _build(inner[0], name, key, source): _build(inner[1], item, f"{key}.{name}", source)
+            for name, item in value.items()
+        }
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+        hint = ""
+        if kind is float and isinstance(value, str):
+            hint = " (YAML reads 1e-3 as text: write 1.0e-3)"
+        raise wrong({float: "a number", int: "a whole number", str: "text", bool: "true or false"}[kind] + hint)
+    if kind is float and not math.isfinite(value):
+        raise wrong("a finite number")
+    return value
+
+
+def _check(config: Config, source: str) -> None:
+    """Refuses values that no run can have."""
+
+    def want(holds: bool, key: str, wanted: str, got: object) -> None:
+        if not holds:
+            raise InputError(f"{source}: {key}: want {wanted}, got {got}")
+
+    encoder, backbone, head, train = config.encoder, config.backbone, config.head, config.train
+    low, high = encoder.point_range[:3], encoder.point_range[3:]
+    want(all(a < b for a, b in zip(low, high, strict=True)), "encoder.point_range",
+         "x_min, y_min, z_min below x_max, y_max, z_max", list(encoder.point_range))  # fmt: skip
+    want(min(encoder.voxel_size) > 0, "encoder.voxel_size", "sizes above 0", list(encoder.voxel_size))
+    for key in ("feature_scales", "projection_scales"):
+        scales = getattr(encoder, key)
+        want(len(scales) > 0 and min(scales, default=0) > 0, f"encoder.{key}", "scales above 0", list(scales))
+        want(len(set(scales)) == len(scales), f"encoder.{key}", "no scale twice", list(scales))
+    for r, (fine, coarse) in enumerate(zip(encoder.projection_scales, encoder.projection_scales[1:], strict=False)):
+        want(coarse == 2 * fine, f"encoder.projection_scales[{r + 1}]", f"twice the scale before, {2 * fine}", coarse)
+    for key in ("feature_channels", "image_channels"):
+        want(getattr(encoder, key) > 0, f"encoder.{key}", "1 or more", getattr(encoder, key))
+    blocks = max(3, len(encoder.projection_scales))
+    for key in ("widths", "layers"):
+        values = getattr(backbone, key)
+        want(len(values) == blocks, f"backbone.{key}", f"{blocks} values, one a block", list(values))
+        want(min(values) > 0, f"backbone.{key}", "values above 0", list(values))
+    want(backbone.fusion_channels > 0, "backbone.fusion_channels", "1 or more", backbone.fusion_channels)
+    want(len(head.classes) > 0, "head.classes", "at least one class", [])
+    names = [entry.name for entry in head.classes]
+    want(len(set(names)) == len(names), "head.classes", "no class twice", names)
+    for k, entry in enumerate(head.classes):
+        key = f"head.classes[{k}]"
+        want(0 <= entry.level < 3, f"{key}.level", "0, 1 or 2", entry.level)
+        want(len(entry.anchor_sizes) > 0, f"{key}.anchor_sizes", "at least one size", [])
+        for size in entry.anchor_sizes:
+            want(min(size) > 0, f"{key}.anchor_sizes", "sizes above 0", list(size))
+        want(0 < entry.positive_iou <= 1, f"{key}.positive_iou", "above 0 and at most 1", entry.positive_iou)
+        want(0 <= entry.negative_iou <= entry.positive_iou, f"{key}.negative_iou",
+             "between 0 and positive_iou", entry.negative_iou)  # fmt: skip
+        want(0 <= entry.focal_alpha <= 1, f"{key}.focal_alpha", "between 0 and 1", entry.focal_alpha)
+        want(entry.focal_gamma >= 0, f"{key}.focal_gamma", "0 or more", entry.focal_gamma)
+        want(0 <= entry.nms_iou <= 1, f"{key}.nms_iou", "between 0 and 1", entry.nms_iou)
+    want(0 <= head.score_threshold < 1, "head.score_threshold", "at least 0 and below 1", head.score_threshold)
+    for key in ("candidates", "detections"):
+        want(getattr(head, key) > 0, f"head.{key}", "1 or more", getattr(head, key))
+    for weight in _keys(LossConfig):
+        want(getattr(config.loss, weight) >= 0, f"loss.{weight}", "0 or more", getattr(config.loss, weight))
+    augment = config.augment
+    want(0 <= augment.flip <= 1, "augment.flip", "between 0 and 1", augment.flip)
+    want(augment.rotation >= 0, "augment.rotation", "0 or more", augment.rotation)
+    want(0 < augment.scaling[0] <= augment.scaling[1], "augment.scaling", "0 < low <= high", list(augment.scaling))
+    want(min(augment.translation) >= 0, "augment.translation", "0 or more", list(augment.translation))
+    for name, count in augment.objects.items():
+        want(name in names, f"augment.objects.{name}", f"a class of head.classes ({', '.join(names)})", name)
+        want(count >= 0, f"augment.objects.{name}", "0 or more", count)
+    for key in ("epochs", "batch_size", "validate_every"):
+        want(getattr(train, key) > 0, f"train.{key}", "1 or more", getattr(train, key))
+    for key in ("warmup_steps", "pictures", "workers", "weight_decay", "seed"):
+        want(getattr(train, key) >= 0, f"train.{key}", "0 or more", getattr(train, key))
+    for key in ("learning_rate", "warmup_ratio", "decay_ratio", "gradient_clip"):
+        want(getattr(train, key) > 0, f"train.{key}", "above 0", getattr(train, key))
+    if config.synthetic is not None:
+        for key in ("train_frames", "val_frames"):
+            want(getattr(config.synthetic, key) > 0, f"synthetic.{key}", "1 or more", getattr(config.synthetic, key))

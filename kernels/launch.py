@@ -1,0 +1,91 @@
+"""Warp's start-up, the bridge from torch to Warp, and the checks at the boundary."""
+
+import functools
+import os
+from collections.abc import Sequence
+
+import torch
+import warp as wp
+from torch import Tensor
+
+wp.config.log_level = wp.LOG_WARNING  # no banner, no line for every module that is loaded
+
+FLOATS = (torch.float32, torch.float64)
+WARP_FLOAT = {torch.float32: wp.float32, torch.float64: wp.float64}
+
+
+@functools.cache
+def start() -> None:
+    """Initialises Warp once. Without a GPU its native code prints a warning nobody can act on: it is kept back."""
+    if torch.cuda.is_available():
+        wp.init()
+        return
+    stderr = os.dup(2)
+    silence = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(silence, 2)
+        wp.init()
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(silence)
+
+
+def array(tensor: Tensor, lanes: int = 0) -> wp.array:
+    """A Warp view of a contiguous tensor; with lanes > 0 its last dimension, (.., lanes), becomes one vector."""
+    start()
+    dtype = None
+    if lanes:
+        dtype = wp.types.vector(length=lanes, dtype=wp.dtype_from_torch(tensor.dtype))
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+def channels(tensor: Tensor, lanes: int) -> wp.array:
+    """A Warp view (N, C / lanes) of vectors over a contiguous channels-last tensor (N, C)."""
+    rows, count = tensor.shape
+    return array(tensor.view(rows, count // lanes, lanes), lanes)
+
+
+def lanes_of(count: int) -> int:
+    """The longest vector that divides the channels: vector-typed loops are the ones that compilers vectorise."""
+    return next(lanes for lanes in (16, 4, 1) if count % lanes == 0)
+
+
+def launch(kernel: wp.Kernel, dim: int | Sequence[int], inputs: Sequence[object], device: torch.device) -> None:
+    """Launches a kernel on the CPU, or on torch's current stream of a CUDA device."""
+    start()
+    if device.type == "cuda":
+        stream = wp.stream_from_torch(torch.cuda.current_stream(device))
+        wp.launch(kernel, dim=dim, inputs=inputs, stream=stream, record_tape=False)
+    else:
+        wp.launch(kernel, dim=dim, inputs=inputs, device="cpu", record_tape=False)
+
+
+def check_tensor(
+    name: str, value: object, dtypes: Sequence[torch.dtype], shape: Sequence[int | None], like: Tensor | None = None
+) -> Tensor:
+    """Checks an argument: a tensor of one of the dtypes, of the shape (None: any length), on the device of `like`.
+
+    Raises TypeError (no tensor, wrong dtype) or ValueError (wrong shape or device), naming the argument.
+    """
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name}: want a torch.Tensor, got {type(value).__name__}")
+    if value.dtype not in dtypes:
+        raise TypeError(f"{name}: want dtype {' or '.join(str(d) for d in dtypes)}, got {value.dtype}")
+    if value.ndim != len(shape) or any(
+        want is not None and got != want for got, want in zip(value.shape, shape, strict=False)
+    ):
+        wanted = ", ".join("any" if length is None else str(length) for length in shape)
+        raise ValueError(f"{name}: want shape ({wanted}), got {tuple(value.shape)}")
+    if like is not None and value.device != like.device:
+        raise ValueError(f"{name}: want device {like.device} as the other arguments, got {value.device}")
+    return value
+
+
+def check_index(name: str, index: Tensor, size: int) -> None:
+    """Checks that every value of an index tensor is in [0, size); reads the device once."""
+    if index.numel() == 0:
+        return
+    low, high = (int(value) for value in torch.stack(torch.aminmax(index)).tolist())
+    if low < 0 or high >= size:
+        raise ValueError(f"{name}: want values in [0, {size}), got {low} to {high}")

@@ -1,0 +1,250 @@
+"""Scatter and gather between points and voxels (Sec. "Efficient Index-based Implementation"), with gradients.
+
+An index is turned into segments, the points of each voxel one after the other, and every kernel is one loop a
+segment: no atomics, a fixed order, hence the same bits on every run and on every device. Features are channels-last,
+and the loops run over vectors of channels.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from hvnet.kernels.launch import (
+    FLOATS,
+    WARP_FLOAT,
+    array,
+    channels,
+    check_index,
+    check_tensor,
+    lanes_of,
+    launch,
+)
+
+
+class Segments(NamedTuple):
+    """The points of every voxel: voxel j owns order[starts[j]:starts[j + 1]], in ascending order of the points."""
+
+    index: Tensor  # (N,) int64, the voxel of each point
+    starts: Tensor  # (V + 1,) int64
+    order: Tensor | None  # (N,) int64, points sorted by voxel; None: they already are
+
+
+def segments(index: Tensor, dim_size: int) -> Segments:
+    """The segments of an index (N,) int64 with values in [0, dim_size)."""
+    values, order = torch.sort(index, stable=True)
+    starts = torch.searchsorted(values, torch.arange(dim_size + 1, device=index.device))
+    return Segments(index, starts, order)
+
+
+def scatter_max(src: Tensor, index: Tensor, dim_size: int) -> tuple[Tensor, Tensor]:
+    """Maximum of the rows of src (N, C) that share an index (N,): values (dim_size, C), arg-max (dim_size, C) int64.
+
+    A tie goes to the largest point index, a NaN is the maximum of its row, an empty row has value 0 and arg-max N.
+    The gradient goes to the arg-max point alone. Raises TypeError or ValueError naming the argument.
+    """
+    return segment_max(src, _checked_segments(src, index, dim_size))
+
+
+def scatter_mean(src: Tensor, index: Tensor, dim_size: int) -> Tensor:
+    """Mean of the rows of src (N, C) that share an index (N,): (dim_size, C); an empty row is 0 (Eq. 2's means)."""
+    return segment_mean(src, _checked_segments(src, index, dim_size))
+
+
+def gather(src: Tensor, index: Tensor) -> Tensor:
+    """The rows src[index]: (V, C) and (N,) int64 give (N, C); the gradient is a sum in a fixed order."""
+    check_tensor("src", src, FLOATS, (None, None))
+    check_tensor("index", index, (torch.int64,), (None,), like=src)
+    check_index("index", index, len(src))
+    return segment_gather(src, segments(index, len(src)))
+
+
+def segment_max(src: Tensor, voxels: Segments) -> tuple[Tensor, Tensor]:
+    """`scatter_max` over segments that are at hand: src (N, C) gives values and arg-max (V, C)."""
+    return _segment_max(src, voxels.index, voxels.order, voxels.starts)
+
+
+def segment_mean(src: Tensor, voxels: Segments) -> Tensor:
+    """`scatter_mean` over segments that are at hand: src (N, C) gives (V, C)."""
+    count = voxels.starts.diff().clamp(min=1).unsqueeze(1)
+    return _segment_sum(src, voxels.index, voxels.order, voxels.starts) / count
+
+
+def segment_gather(src: Tensor, voxels: Segments) -> Tensor:
+    """`gather` over segments that are at hand: src (V, C) gives (N, C)."""
+    return _gather(src, voxels.index, voxels.order, voxels.starts)
+
+
+def _checked_segments(src: Tensor, index: Tensor, dim_size: int) -> Segments:
+    check_tensor("src", src, FLOATS, (None, None))
+    check_tensor("index", index, (torch.int64,), (len(src),), like=src)
+    if dim_size < 0:
+        raise ValueError(f"dim_size: want 0 or more, got {dim_size}")
+    check_index("index", index, dim_size)
+    return segments(index, dim_size)
+
+
+@functools.cache
+def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
+    """The kernels for one floating type and vector length, in a module of their own."""
+    vec = wp.types.vector(length=lanes, dtype=dtype)
+    ivec = wp.types.vector(length=lanes, dtype=wp.int64)
+    module = wp.Module(f"hvnet_scatter_{dtype.__name__}_{lanes}", None)
+
+    @wp.func
+    def point_at(order: wp.array(dtype=wp.int64), k: int):
+        i = k
+        if order.shape[0] > 0:
+            i = int(order[k])
+        return i
+
+    @wp.kernel(enable_backward=False, module=module)
+    def maximum(
+        src: wp.array2d(dtype=vec),
+        order: wp.array(dtype=wp.int64),
+        starts: wp.array(dtype=wp.int64),
+        values: wp.array2d(dtype=vec),
+        argmax: wp.array2d(dtype=ivec),
+    ):
+        voxel, c = wp.tid()
+        start = int(starts[voxel])
+        end = int(starts[voxel + 1])
+        best = vec()
+        at = ivec(wp.int64(src.shape[0]))
+        if start < end:
+            i = point_at(order, start)
+            best = src[i, c]
+            at = ivec(wp.int64(i))
+        for k in range(start + 1, end):
+            i = point_at(order, k)
+            row = src[i, c]
+            for lane in range(lanes):
+                # negated, so that a NaN wins; a later point wins a tie, unless the best is a NaN and it is not
+                if not (row[lane] < best[lane]) and (row[lane] != row[lane] or best[lane] == best[lane]):
+                    best[lane] = row[lane]
+                    at[lane] = wp.int64(i)
+        values[voxel, c] = best
+        argmax[voxel, c] = at
+
+    @wp.kernel(enable_backward=False, module=module)
+    def maximum_backward(
+        grad: wp.array2d(dtype=vec),
+        argmax: wp.array2d(dtype=ivec),
+        index: wp.array(dtype=wp.int64),
+        grad_src: wp.array2d(dtype=vec),
+    ):
+        i, c = wp.tid()
+        voxel = int(index[i])
+        given = grad[voxel, c]
+        at = argmax[voxel, c]
+        taken = vec()
+        for lane in range(lanes):
+            if at[lane] == wp.int64(i):
+                taken[lane] = given[lane]
+        grad_src[i, c] = taken
+
+    @wp.kernel(enable_backward=False, module=module)
+    def total(
+        src: wp.array2d(dtype=vec),
+        order: wp.array(dtype=wp.int64),
+        starts: wp.array(dtype=wp.int64),
+        values: wp.array2d(dtype=vec),
+    ):
+        voxel, c = wp.tid()
+        value = vec()
+        for k in range(int(starts[voxel]), int(starts[voxel + 1])):
+            value += src[point_at(order, k), c]
+        values[voxel, c] = value
+
+    return SimpleNamespace(maximum=maximum, maximum_backward=maximum_backward, total=total)
+
+
+def _order_array(order: Tensor | None, like: Tensor) -> wp.array:
+    return array(like.new_empty(0) if order is None else order.contiguous())
+
+
+@torch.library.custom_op("hvnet::segment_max", mutates_args=())
+def _segment_max(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> tuple[Tensor, Tensor]:
+    count, lanes = src.shape[1], lanes_of(src.shape[1])
+    values = src.new_empty(len(starts) - 1, count)
+    argmax = torch.empty(len(starts) - 1, count, dtype=torch.int64, device=src.device)
+    inputs = [channels(src.contiguous(), lanes), _order_array(order, starts), array(starts)]
+    inputs += [channels(values, lanes), channels(argmax, lanes)]
+    launch(_kernels(WARP_FLOAT[src.dtype], lanes).maximum, (len(values), count // lanes), inputs, src.device)
+    return values, argmax
+
+
+@_segment_max.register_fake
+def _(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> tuple[Tensor, Tensor]:
+    values = src.new_empty(len(starts) - 1, src.shape[1])
+    return values, torch.empty_like(values, dtype=torch.int64)
+
+
+@torch.library.custom_op("hvnet::segment_max_backward", mutates_args=())
+def _segment_max_backward(grad: Tensor, argmax: Tensor, index: Tensor) -> Tensor:
+    count, lanes = grad.shape[1], lanes_of(grad.shape[1])
+    grad_src = grad.new_empty(len(index), count)
+    inputs = [channels(grad.contiguous(), lanes), channels(argmax, lanes), array(index.contiguous())]
+    inputs += [channels(grad_src, lanes)]
+    kernel = _kernels(WARP_FLOAT[grad.dtype], lanes).maximum_backward
+    launch(kernel, (len(index), count // lanes), inputs, grad.device)
+    return grad_src
+
+
+@_segment_max_backward.register_fake
+def _(grad: Tensor, argmax: Tensor, index: Tensor) -> Tensor:
+    return grad.new_empty(len(index), grad.shape[1])
+
+
+@torch.library.custom_op("hvnet::segment_sum", mutates_args=())
+def _segment_sum(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
+    count, lanes = src.shape[1], lanes_of(src.shape[1])
+    values = src.new_empty(len(starts) - 1, count)
+    inputs = [channels(src.contiguous(), lanes), _order_array(order, starts), array(starts), channels(values, lanes)]
+    launch(_kernels(WARP_FLOAT[src.dtype], lanes).total, (len(values), count // lanes), inputs, src.device)
+    return values
+
+
+@_segment_sum.register_fake
+def _(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
+    return src.new_empty(len(starts) - 1, src.shape[1])
+
+
+@torch.library.custom_op("hvnet::gather", mutates_args=())
+def _gather(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
+    return src.index_select(0, index)  # a plain slice is fast enough, as the paper says; its own gradient is not
+
+
+@_gather.register_fake
+def _(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
+    return src.new_empty(len(index), src.shape[1])
+
+
+def _save_max(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:
+    ctx.mark_non_differentiable(output[1])
+    ctx.save_for_backward(output[1], inputs[1])
+
+
+def _max_backward(ctx: Any, grad: Tensor, _: Any) -> tuple[Tensor, None, None, None]:
+    argmax, index = ctx.saved_tensors
+    return _segment_max_backward(grad, argmax, index), None, None, None
+
+
+def _save_segments(ctx: Any, inputs: tuple, output: Tensor) -> None:
+    ctx.save_for_backward(*inputs[1:])
+
+
+def _sum_backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
+    return _gather(grad.contiguous(), *ctx.saved_tensors), None, None, None
+
+
+def _gather_backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
+    return _segment_sum(grad.contiguous(), *ctx.saved_tensors), None, None, None
+
+
+_segment_max.register_autograd(_max_backward, setup_context=_save_max)
+_segment_sum.register_autograd(_sum_backward, setup_context=_save_segments)
+_gather.register_autograd(_gather_backward, setup_context=_save_segments)
