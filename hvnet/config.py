@@ -216,7 +216,8 @@ def _build(kind: Any, value: Any, key: str, source: str) -> Any:
             return tuple(_build(inner[0], item, f"{key}[{k}]", source) for k, item in enumerate(value))
         if len(value) != len(inner):
             raise wrong(f"a list of {len(inner)}")
-        return tuple(_build(t, item, f"{key}[{k}]", source) for k, (t, item) in enumerate(zip(inner, value, strict=True)))
+        items = enumerate(zip(inner, value, strict=True))
+        return tuple(_build(item_kind, item, f"{key}[{k}]", source) for k, (item_kind, item) in items)
     if origin is dict:
         if not isinstance(value, dict):
             raise wrong("a mapping")
@@ -260,7 +261,10 @@ def _check(config: Config, source: str) -> None:
     for key in ("widths", "layers"):
         values = getattr(backbone, key)
         want(len(values) == blocks, f"backbone.{key}", f"{blocks} values, one a block", list(values))
-        want(min(values) > 0, f"backbone.{key}", "values above 0", list(values))
+    want(min(backbone.widths) > 0, "backbone.widths", "values above 0", list(backbone.widths))
+    want(
+        min(backbone.layers) > 1, "backbone.layers", "2 or more (an image joins after the first)", list(backbone.layers)
+    )
     want(backbone.fusion_channels > 0, "backbone.fusion_channels", "1 or more", backbone.fusion_channels)
     want(len(head.classes) > 0, "head.classes", "at least one class", [])
     names = [entry.name for entry in head.classes]

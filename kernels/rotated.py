@@ -25,7 +25,7 @@ def _kernels(dtype: Any) -> SimpleNamespace:
     module = wp.Module(f"hvnet_rotated_{dtype.__name__}", None)
 
     @wp.func
-    def edge_area(x0: dtype, y0: dtype, x1: dtype, y1: dtype, l: dtype, w: dtype):  # noqa: E741
+    def edge_area(x0: dtype, y0: dtype, x1: dtype, y1: dtype, l: dtype, w: dtype):
         """The integral of clamp(x, -l, l) dy along one edge where |y| <= w (l, w: half sizes)."""
         area = zero
         low = wp.clamp(y0, -w, w)
@@ -52,28 +52,37 @@ def _kernels(dtype: Any) -> SimpleNamespace:
         dx = b[j, 0] - a[i, 0]
         dy = b[j, 1] - a[i, 1]
         reach = half * (wp.length(wp.vector(a[i, 3], a[i, 4])) + wp.length(wp.vector(b[j, 3], b[j, 4])))
-        area = zero
-        if dx * dx + dy * dy < reach * reach:
-            cos_a = wp.cos(a[i, 6])
-            sin_a = wp.sin(a[i, 6])
-            x = dx * cos_a + dy * sin_a
-            y = dy * cos_a - dx * sin_a
-            cos = wp.cos(b[j, 6] - a[i, 6])
-            sin = wp.sin(b[j, 6] - a[i, 6])
-            lx = half * b[j, 3] * cos
-            ly = half * b[j, 3] * sin
-            wx = -half * b[j, 4] * sin
-            wy = half * b[j, 4] * cos
-            l = half * a[i, 3]  # noqa: E741
-            w = half * a[i, 4]
-            area = (
-                edge_area(x + lx + wx, y + ly + wy, x - lx + wx, y - ly + wy, l, w)
-                + edge_area(x - lx + wx, y - ly + wy, x - lx - wx, y - ly - wy, l, w)
-                + edge_area(x - lx - wx, y - ly - wy, x + lx - wx, y + ly - wy, l, w)
-                + edge_area(x + lx - wx, y + ly - wy, x + lx + wx, y + ly + wy, l, w)
-            )
-            if not (area > zero):
-                area = zero
+        if not (dx * dx + dy * dy < reach * reach):
+            return zero
+        cos_a = wp.cos(a[i, 6])
+        sin_a = wp.sin(a[i, 6])
+        x = dx * cos_a + dy * sin_a
+        y = dy * cos_a - dx * sin_a
+        cos = wp.cos(b[j, 6] - a[i, 6])
+        sin = wp.sin(b[j, 6] - a[i, 6])
+        l = half * a[i, 3]
+        w = half * a[i, 4]
+        bl = half * b[j, 3]
+        bw = half * b[j, 4]
+        # separating axes: boxes that lie apart share exactly nothing, not the rounding residue of four integrals
+        if wp.abs(x) >= l + bl * wp.abs(cos) + bw * wp.abs(sin) or wp.abs(y) >= w + bl * wp.abs(sin) + bw * wp.abs(cos):
+            return zero
+        if wp.abs(x * cos + y * sin) >= bl + l * wp.abs(cos) + w * wp.abs(sin):
+            return zero
+        if wp.abs(y * cos - x * sin) >= bw + l * wp.abs(sin) + w * wp.abs(cos):
+            return zero
+        lx = bl * cos
+        ly = bl * sin
+        wx = -bw * sin
+        wy = bw * cos
+        area = (
+            edge_area(x + lx + wx, y + ly + wy, x - lx + wx, y - ly + wy, l, w)
+            + edge_area(x - lx + wx, y - ly + wy, x - lx - wx, y - ly - wy, l, w)
+            + edge_area(x - lx - wx, y - ly - wy, x + lx - wx, y + ly - wy, l, w)
+            + edge_area(x + lx - wx, y + ly - wy, x + lx + wx, y + ly + wy, l, w)
+        )
+        if not (area > zero):
+            area = zero
         return area
 
     @wp.func
@@ -149,9 +158,7 @@ def _kernels(dtype: Any) -> SimpleNamespace:
         iou[sample, i] = highest
         box[sample, i] = wp.int64(at)
 
-    return SimpleNamespace(
-        matrix_bev=matrix_bev, matrix_3d=matrix_3d, pairs=pairs, nms_mask=nms_mask, match=match
-    )
+    return SimpleNamespace(matrix_bev=matrix_bev, matrix_3d=matrix_3d, pairs=pairs, nms_mask=nms_mask, match=match)
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -216,8 +223,10 @@ def rotated_match(anchors: Tensor, boxes: Tensor, starts: Tensor) -> tuple[Tenso
     """
     _check_pair(anchors, boxes, "anchors", "boxes")
     check_tensor("starts", starts, (torch.int64,), (None,), like=boxes)
-    if len(anchors) >= 2**31 or len(starts) < 1:
-        raise ValueError(f"want below 2^31 anchors and at least one start, got {len(anchors)} and {len(starts)}")
+    if len(anchors) >= 2**31:
+        raise ValueError(f"anchors: want fewer than 2^31, got {len(anchors)}")
+    if len(starts) == 0 or starts[0] != 0 or starts[-1] != len(boxes) or (starts.diff() < 0).any():
+        raise ValueError(f"starts: want ascending values from 0 to {len(boxes)}, got {starts.tolist()}")
     batch = len(starts) - 1
     iou = anchors.new_empty(batch, len(anchors))
     match = torch.empty(batch, len(anchors), dtype=torch.int64, device=anchors.device)

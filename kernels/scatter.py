@@ -92,6 +92,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
     """The kernels for one floating type and vector length, in a module of their own."""
     vec = wp.types.vector(length=lanes, dtype=dtype)
     ivec = wp.types.vector(length=lanes, dtype=wp.int64)
+    sums = wp.types.vector(length=lanes, dtype=wp.float64)
     module = wp.Module(f"hvnet_scatter_{dtype.__name__}_{lanes}", None)
 
     @wp.func
@@ -154,10 +155,16 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         values: wp.array2d(dtype=vec),
     ):
         voxel, c = wp.tid()
-        value = vec()
+        # in float64: a million float32 summed one by one would be off by a hundredth
+        value = sums()
         for k in range(int(starts[voxel]), int(starts[voxel + 1])):
-            value += src[point_at(order, k), c]
-        values[voxel, c] = value
+            row = src[point_at(order, k), c]
+            for lane in range(lanes):
+                value[lane] = value[lane] + wp.float64(row[lane])
+        rounded = vec()
+        for lane in range(lanes):
+            rounded[lane] = dtype(value[lane])
+        values[voxel, c] = rounded
 
     return SimpleNamespace(maximum=maximum, maximum_backward=maximum_backward, total=total)
 

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from hvnet.kernels.launch import array, check_tensor, launch
+from hvnet.kernels.launch import array, check_index, check_tensor, launch
 from hvnet.kernels.scatter import Segments
 
 KEY_BITS = 62  # of a sort key in int64
@@ -55,12 +55,10 @@ class VoxelIndex(NamedTuple):
     scales: list[Voxels]
 
 
-def make_grid(
-    point_range: Sequence[float], voxel_size: Sequence[float], scale: float, multiple: int = 1
-) -> Grid:
+def make_grid(point_range: Sequence[float], voxel_size: Sequence[float], scale: float, multiple: int = 1) -> Grid:
     """The grid of voxels of voxel_size (v_L, v_W) times scale over (x_min, y_min, z_min, x_max, y_max, z_max).
 
-    The last cell may reach past the range (0.3 m does not divide 64 m); the shape in memory is a multiple of `multiple`.
+    The last cell may reach past the range (0.3 m does not divide 64 m); the shape in memory is padded to `multiple`.
     """
     x_min, y_min, z_min, x_max, y_max, z_max = point_range
     if not (x_max > x_min and y_max > y_min and z_max > z_min):
@@ -69,7 +67,8 @@ def make_grid(
         raise ValueError(f"voxel_size and scale: want values above 0, got {tuple(voxel_size)} and {scale}")
     cell = (voxel_size[0] * scale, voxel_size[1] * scale)
     # 64 / 0.1 is 640.0000000000001 or 639.9999999999999 as the case may be: a millionth of a cell is no cell
-    cells = (math.ceil((x_max - x_min) / cell[0] - 1e-6), math.ceil((y_max - y_min) / cell[1] - 1e-6))
+    extent = (x_max - x_min, y_max - y_min)
+    cells = (max(1, math.ceil(extent[0] / cell[0] - 1e-6)), max(1, math.ceil(extent[1] / cell[1] - 1e-6)))
     shape = (-(-cells[0] // multiple) * multiple, -(-cells[1] // multiple) * multiple)
     return Grid(x_min, y_min, z_min, z_max, cell, cells, shape)
 
@@ -104,6 +103,13 @@ def voxel_index(points: Tensor, sample: Tensor, batch_size: int, grids: Sequence
     Morton key of the finest grid makes every voxel of every scale a run of consecutive points; other scales, and grids
     too large for a key, go through the hash table.
     """
+    _check_points(points, sample)
+    check_index("sample", sample, batch_size)
+    if not grids:
+        raise ValueError("grids: want at least one grid, got none")
+    for grid in grids:
+        if batch_size * grid.shape[0] * grid.shape[1] >= 2**63:
+            raise ValueError(f"grids: {batch_size} samples of {grid.shape} cells have cursors beyond int64")
     by_scale = [cursors(points, sample, grid) for grid in grids]
     inside = by_scale[0].ge(0)
     for cursor in by_scale[1:]:
@@ -124,6 +130,7 @@ def hash_index(cursor: Tensor) -> tuple[Tensor, Tensor]:
     Open addressing; the table's layout depends on the order of insertion, and sorting the voxels removes that.
     """
     check_tensor("cursor", cursor, (torch.int64,), (None,))
+    check_index("cursor", cursor, 2**63)
     capacity = 1 << max(2 * len(cursor) - 1, 1).bit_length()
     table = torch.full((capacity,), -1, dtype=torch.int64, device=cursor.device)
     slot = torch.empty_like(cursor)
@@ -137,7 +144,8 @@ def hash_index(cursor: Tensor) -> tuple[Tensor, Tensor]:
 def _nests(grid: Grid, finest: Grid) -> bool:
     """Whether the cells of a grid are a power of two times the finest ones, to the bit, so that runs stay runs."""
     ratio = grid.cell[0] / finest.cell[0]
-    return math.frexp(ratio)[0] == 0.5 and grid.cell[1] / finest.cell[1] == ratio
+    same_origin = (grid.x_min, grid.y_min) == (finest.x_min, finest.y_min)
+    return same_origin and math.frexp(ratio)[0] == 0.5 and grid.cell[1] / finest.cell[1] == ratio
 
 
 def _morton_keys(cursor: Tensor, grid: Grid, bits: int) -> Tensor:

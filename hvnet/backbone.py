@@ -1,0 +1,118 @@
+"""Backbone (Sec. 3.4): the main stream with multi-scale aggregation and the feature fusion pyramid network (FFPN)."""
+
+import torch
+from torch import Tensor, nn
+
+from hvnet.config import BackboneConfig
+
+
+def conv_bn_relu(in_channels: int, out_channels: int, kernel: int, stride: int = 1) -> nn.Sequential:
+    """Convolution that keeps the size (divided by the stride), batch norm, ReLU."""
+    return nn.Sequential(
+        nn.Conv2d(in_channels, out_channels, kernel, stride, padding=kernel // 2, bias=False),
+        nn.BatchNorm2d(out_channels),
+        nn.ReLU(inplace=True),
+    )
+
+
+def deconv_bn_relu(in_channels: int, out_channels: int, stride: int) -> nn.Sequential:
+    """Transposed convolution that enlarges a map `stride` times, batch norm, ReLU."""
+    return nn.Sequential(
+        nn.ConvTranspose2d(in_channels, out_channels, stride, stride, bias=False),
+        nn.BatchNorm2d(out_channels),
+        nn.ReLU(inplace=True),
+    )
+
+
+class Block(nn.Module):
+    """A block of the main stream; a pseudo-image of its resolution joins after the first layer by concatenation."""
+
+    def __init__(self, in_channels: int, image_channels: int, width: int, layers: int, stride: int) -> None:
+        super().__init__()
+        self.first = conv_bn_relu(in_channels, width, 3, stride)
+        joined = [width + image_channels] + [width] * (layers - 2)
+        self.rest = nn.Sequential(*(conv_bn_relu(channels, width, 3) for channels in joined))
+
+    def forward(self, features: Tensor, image: Tensor | None) -> Tensor:
+        """Features (B, C, H, W), image (B, N_H, H / stride, W / stride) or None: (B, width, H / stride, W / stride)."""
+        features = self.first(features)
+        if image is not None:
+            features = torch.cat((features, image), dim=1)
+        return self.rest(features)
+
+
+class MainStream(nn.Module):
+    """Blocks 1, 2, ...: each but the first halves the map and takes in the next pseudo-image (Sec. 3.4)."""
+
+    def __init__(self, config: BackboneConfig, image_channels: int, images: int) -> None:
+        super().__init__()
+        blocks = []
+        before = image_channels
+        for k, (width, layers) in enumerate(zip(config.widths, config.layers, strict=True)):
+            joins = image_channels if 0 < k < images else 0
+            blocks.append(Block(before, joins, width, layers, stride=1 if k == 0 else 2))
+            before = width
+        self.blocks = nn.ModuleList(blocks)
+
+    def forward(self, images: list[Tensor]) -> list[Tensor]:
+        """Pseudo-images, finest first, to the outputs B_1, B_2, B_3 of the last three blocks."""
+        features, outputs = images[0], []
+        for k, block in enumerate(self.blocks):
+            features = block(features, images[k] if 0 < k < len(images) else None)
+            outputs.append(features)
+        return outputs[-3:]
+
+
+class FFPN(nn.Module):
+    """Eq. 4: B_f concatenates Psi_i([B_i, Gamma_{i+1}(B_{i+1})]) at the finest scale; Upsilon gives a map a level.
+
+    Gamma is a deconvolution to the next finer map, Psi a convolution and a deconvolution to the finest one, Upsilon a
+    chain of convolutions of strides 1, 2, 2.
+    """
+
+    def __init__(self, widths: tuple[int, ...], channels: int) -> None:
+        super().__init__()
+        fine, middle, coarse = widths
+        self.gamma = nn.ModuleList([deconv_bn_relu(middle, fine, 2), deconv_bn_relu(coarse, middle, 2)])
+        self.psi = nn.ModuleList(
+            [
+                conv_bn_relu(2 * fine, channels, 1),
+                nn.Sequential(conv_bn_relu(2 * middle, channels, 1), deconv_bn_relu(channels, channels, 2)),
+                nn.Sequential(conv_bn_relu(coarse, channels, 1), deconv_bn_relu(channels, channels, 4)),
+            ]
+        )
+        self.upsilon = nn.ModuleList(
+            [
+                conv_bn_relu(3 * channels, channels, 1),
+                conv_bn_relu(channels, channels, 3, 2),
+                conv_bn_relu(channels, channels, 3, 2),
+            ]
+        )
+
+    def forward(self, maps: list[Tensor]) -> list[Tensor]:
+        """B_1, B_2, B_3 to the pyramid levels B_o at 1/1, 1/2 and 1/4 of B_1, `channels` each."""
+        fine, middle, coarse = maps
+        scales = [
+            torch.cat((fine, self.gamma[0](middle)), dim=1),
+            torch.cat((middle, self.gamma[1](coarse)), dim=1),
+            coarse,
+        ]
+        fused = torch.cat([psi(scale) for psi, scale in zip(self.psi, scales, strict=True)], dim=1)  # B_f
+        levels = []
+        for upsilon in self.upsilon:
+            fused = upsilon(fused)
+            levels.append(fused)
+        return levels
+
+
+class Backbone(nn.Module):
+    """Main stream and FFPN: pseudo-images to three pyramid levels."""
+
+    def __init__(self, config: BackboneConfig, image_channels: int, images: int) -> None:
+        super().__init__()
+        self.main_stream = MainStream(config, image_channels, images)
+        self.ffpn = FFPN(config.widths[-3:], config.fusion_channels)
+
+    def forward(self, images: list[Tensor]) -> list[Tensor]:
+        """Pseudo-images (B, N_H, N_L, N_W) / 2^r to pyramid levels (B, C, N_L, N_W) / 2^k."""
+        return self.ffpn(self.main_stream(images))

@@ -1,0 +1,139 @@
+"""3D data augmentation (the paper's section 4.1): ground-truth sampling, then flip, rotation, scaling, translation.
+
+Points (N, 4) and boxes (M, 7) are in LiDAR axes. Nothing is changed in place, and every random number comes from the
+generator that is passed in: one that is seeded by (seed, epoch, index) makes a sample repeatable on its own.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from torch import Generator, Tensor
+
+from hvnet.boxes import boxes_collide, limit_angle, points_in_boxes
+from hvnet.config import AugmentConfig
+from hvnet.data.database import Database, object_points
+
+MIN_POINTS = 5
+"""Objects of fewer points are not inserted, as in SECOND."""
+
+
+def augment(
+    points: Tensor,
+    boxes: Tensor,
+    labels: Tensor,
+    database: Database | None,
+    options: AugmentConfig,
+    generator: Generator,
+    classes: Sequence[str],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Augments one frame: points (N, 4), boxes (M, 7) and labels (M,), which number the boxes' classes in `classes`.
+
+    Objects are inserted first, as in SECOND, which the paper follows, though it names the global changes first: objects
+    keep the pose in which the scanner saw them, which is in the camera's view only before the frame is turned.
+    """
+    if database is not None:
+        points, boxes, labels = sample_objects(points, boxes, labels, database, options.objects, generator, classes)
+    points, boxes = random_flip(points, boxes, options.flip, generator)
+    points, boxes = random_rotation(points, boxes, options.rotation, generator)
+    points, boxes = random_scaling(points, boxes, options.scaling, generator)
+    points, boxes = random_translation(points, boxes, options.translation, generator)
+    return points, boxes, labels
+
+
+def random_flip(points: Tensor, boxes: Tensor, probability: float, generator: Generator) -> tuple[Tensor, Tensor]:
+    """Mirrors left and right, y to -y, with the given probability."""
+    if torch.rand((), generator=generator).item() >= probability:
+        return points, boxes
+    points, boxes = points.clone(), boxes.clone()
+    points[:, 1] *= -1
+    boxes[:, 1] *= -1
+    boxes[:, 6] = limit_angle(-boxes[:, 6])
+    return points, boxes
+
+
+def random_rotation(points: Tensor, boxes: Tensor, limit: float, generator: Generator) -> tuple[Tensor, Tensor]:
+    """Turns all about the LiDAR's z axis by an angle uniform in [-limit, limit], radians."""
+    angle = _uniform(-limit, limit, generator)
+    cos, sin = math.cos(angle), math.sin(angle)
+    points, boxes = points.clone(), boxes.clone()
+    for rows in (points, boxes):
+        x, y = rows[:, 0].clone(), rows[:, 1].clone()
+        rows[:, 0] = x * cos - y * sin
+        rows[:, 1] = x * sin + y * cos
+    boxes[:, 6] = limit_angle(boxes[:, 6] + angle)
+    return points, boxes
+
+
+def random_scaling(
+    points: Tensor, boxes: Tensor, limits: tuple[float, float], generator: Generator
+) -> tuple[Tensor, Tensor]:
+    """Scales all about the LiDAR by a factor uniform between the limits."""
+    factor = _uniform(*limits, generator)
+    points, boxes = points.clone(), boxes.clone()
+    points[:, :3] *= factor
+    boxes[:, :6] *= factor
+    return points, boxes
+
+
+def random_translation(
+    points: Tensor, boxes: Tensor, deviation: tuple[float, float, float], generator: Generator
+) -> tuple[Tensor, Tensor]:
+    """Moves all by a normal distribution of mean 0 and the given standard deviations along x, y and z, metres."""
+    shift = torch.randn(3, generator=generator) * torch.tensor(deviation)
+    points, boxes = points.clone(), boxes.clone()
+    points[:, :3] += shift
+    boxes[:, :3] += shift
+    return points, boxes
+
+
+def sample_objects(
+    points: Tensor,
+    boxes: Tensor,
+    labels: Tensor,
+    database: Database,
+    counts: Mapping[str, int],
+    generator: Generator,
+    classes: Sequence[str],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Ground-truth sampling of SECOND: inserts objects of other frames, where they stood in these.
+
+    labels (M,) int64 number the boxes' classes in `classes`; boxes of any other number only block their place. Of each
+    class in `counts` so many objects are drawn, without replacement, that the frame has this count of them; one that
+    collides in bird's eye view with a box of the frame or with one inserted before is given up, not redrawn. Points of
+    the frame inside an inserted box give way to the object's own.
+    """
+    candidates = []
+    chosen_labels: list[int] = []
+    usable = _usable(database)
+    for name, count in counts.items():
+        label = classes.index(name)
+        missing = max(0, count - int((labels == label).sum()))
+        objects = np.flatnonzero(usable & (database.name == name))
+        picked = torch.randperm(len(objects), generator=generator)[:missing].numpy()
+        candidates.append(objects[picked])
+        chosen_labels += [label] * len(picked)
+    drawn = np.concatenate(candidates) if candidates else np.empty(0, np.int64)
+    drawn_boxes = torch.from_numpy(database.box[drawn])
+    collides = boxes_collide(drawn_boxes, torch.cat((boxes, drawn_boxes))).numpy()
+    standing = np.arange(len(boxes) + len(drawn)) < len(boxes)
+    for k in range(len(drawn)):
+        standing[len(boxes) + k] = not (collides[k] & standing).any()
+    inserted = np.flatnonzero(standing[len(boxes) :])
+    if len(inserted) == 0:
+        return points, boxes, labels
+    new_boxes = drawn_boxes[inserted]
+    points = points[~points_in_boxes(points, new_boxes).any(dim=1)]
+    points = torch.cat([points, *(object_points(database, k) for k in drawn[inserted])])
+    return points, torch.cat((boxes, new_boxes)), torch.cat((labels, labels.new_tensor(chosen_labels)[inserted]))
+
+
+def _usable(database: Database) -> np.ndarray:
+    """Which objects (K,) are rated by KITTI (easy, moderate or hard; SECOND leaves out the others) and have points."""
+    rated = (database.bbox_height > 25) & (database.occlusion <= 2) & (database.truncation <= 0.5)
+    return rated & (np.diff(database.offsets) >= MIN_POINTS)
+
+
+def _uniform(low: float, high: float, generator: Generator) -> float:
+    return low + (high - low) * torch.rand((), generator=generator).item()

@@ -1,0 +1,374 @@
+"""Matching of detections with ground truths by the rules of KITTI's devkit, for `hvnet.evaluate`.
+
+The devkit (evaluate_object_3d_offline; Geiger et al., CVPR 2012) matches every frame once per score threshold. Here a
+frame is matched once for every score that one of its overlapping detections has, since nothing else can change its
+counts; the running sum over all frames then holds the devkit's counts at every threshold there is.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numba import njit
+from numpy.typing import NDArray
+
+from hvnet.data.kitti import Labels
+from hvnet.kernels.rotated import rotated_overlap_pairs
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+METRICS = ("2d", "bev", "3d")
+NEIGHBOURS = {"Car": "Van", "Pedestrian": "Person_sitting"}
+"""So like a class that to find one is neither right nor wrong."""
+
+
+class Level(NamedTuple):
+    """Which ground truths of a class are to be found; the others are neither found nor missed."""
+
+    name: str
+    max_occlusion: float = math.inf
+    max_truncation: float = math.inf
+    min_height: float = -1  # pixels in the image; detections have to have them too
+    distance: tuple[float, float] = (0, math.inf)  # metres on the ground, from and below; of detections too
+
+
+LEVELS = (Level("easy", 0, 0.15, 40), Level("moderate", 1, 0.3, 25), Level("hard", 2, 0.5, 25))
+LEVELS_WITHOUT_2D = tuple(level._replace(min_height=-1) for level in LEVELS)
+
+
+def distance_levels(bands: Iterable[tuple[float, float]]) -> tuple[Level, ...]:
+    """One level for each band of distances in metres, whatever the occlusion, the truncation and the 2D box."""
+    return tuple(Level(f"{near:g}-{far:g}m", distance=(near, far)) for near, far in bands)
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Ground truths and detections of the same frame, in the order of frame, ground truth, detection."""
+
+    frame: Integers  # (P,)
+    truth: Integers  # (P,) row among the ground truths of all frames
+    detection: Integers  # (P,) row among the detections of all frames
+    overlap: Floats  # (P,) intersection over union
+
+    def select(self, mask: Mask) -> "Pairs":
+        """The pairs that a mask picks."""
+        return Pairs(self.frame[mask], self.truth[mask], self.detection[mask], self.overlap[mask])
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The ground truths (G) and the detections (D) of all frames, and how much they overlap."""
+
+    truths: Labels
+    detections: Labels
+    score: Floats  # (D,)
+    pairs: dict[str, Pairs]  # for every metric, those that overlap at all
+    dontcare: Floats  # (D,) share of the detection's 2D box in the DontCare region that holds most of it
+
+
+@dataclass(frozen=True)
+class Matching:
+    """The question for one class, metric, minimum overlap and difficulty: who may be matched, and what it counts."""
+
+    pairs: Pairs  # those that overlap enough
+    truths: Mask  # (G,) ground truths that are found or missed; the others may be matched, but count for nothing
+    ignored: Mask  # (D,) detections that may be matched, but are neither right nor wrong
+    countable: Mask  # (D,) detections that are false positives where they are matched with nothing
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Counts over all frames when the detections below a score are dropped, for every score, the highest first."""
+
+    score: Floats  # (S,)
+    true_positives: Floats  # (S,)
+    false_positives: Floats  # (S,)
+    misses: Floats  # (S,)
+    similarity: Floats  # (S,) sum over the true positives of (1 + cos(difference of alpha)) / 2
+
+    @property
+    def recall(self) -> Floats:
+        """Share (S,) of the ground truths that are found."""
+        return self.true_positives / np.maximum(self.true_positives + self.misses, 1)
+
+    @property
+    def precision(self) -> Floats:
+        """Share (S,) of the detections that are right."""
+        return self.true_positives / np.maximum(self.true_positives + self.false_positives, 1)
+
+    @property
+    def orientation(self) -> Floats:
+        """Mean similarity of orientation (S,) of the detections, 0 for a false positive."""
+        return self.similarity / np.maximum(self.true_positives + self.false_positives, 1)
+
+    def select(self, rows: Integers) -> "Counts":
+        """The counts at some of the scores."""
+        return Counts(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+
+
+def find_candidates(labels: Sequence[Labels], predictions: Sequence[Labels]) -> Candidates:
+    """The overlaps of all frames' ground truths and detections; one `Labels` a frame in both."""
+    truths, truth_starts = _concatenate(labels)
+    detections, detection_starts = _concatenate(predictions)
+    if detections.score is None:
+        raise ValueError("predictions: want a score for every detection, got frames without scores")
+    frame, truth, detection = _meeting(truths.bbox, truth_starts, detections.bbox, detection_starts).T
+    a, b = truths.bbox[truth], detections.bbox[detection]
+    shared = (np.minimum(a[:, 2:], b[:, 2:]) - np.maximum(a[:, :2], b[:, :2])).prod(axis=1)
+    area_a, area_b = (a[:, 2:] - a[:, :2]).prod(axis=1), (b[:, 2:] - b[:, :2]).prod(axis=1)
+    pairs = {"2d": Pairs(frame, truth, detection, shared / (area_a + area_b - shared))}
+
+    dontcare = np.zeros(len(detections))
+    regions = truths.name[truth] == "DontCare"
+    np.maximum.at(dontcare, detection[regions], (shared / area_b)[regions])
+
+    bev_truths, bev_detections = _bev_boxes(truths), _bev_boxes(detections)
+    bounds = _bev_bounds(bev_truths), _bev_bounds(bev_detections)
+    frame, truth, detection = _meeting(bounds[0], truth_starts, bounds[1], detection_starts).T
+    a, b = bev_truths[truth], bev_detections[detection]
+    shared = rotated_overlap_pairs(torch.from_numpy(a), torch.from_numpy(b)).numpy()
+    area_a, area_b = a[:, 3] * a[:, 4], b[:, 3] * b[:, 4]
+    pairs["bev"] = Pairs(frame, truth, detection, shared / (area_a + area_b - shared))
+    (top_a, bottom_a), (top_b, bottom_b) = _vertical(truths, truth), _vertical(detections, detection)
+    shared = shared * np.maximum(np.minimum(bottom_a, bottom_b) - np.maximum(top_a, top_b), 0)
+    volume = area_a * a[:, 5] + area_b * b[:, 5] - shared
+    pairs["3d"] = Pairs(frame, truth, detection, shared / np.where(volume > 0, volume, 1))
+    return Candidates(truths, detections, detections.score, pairs, dontcare)
+
+
+def ground_distance(labels: Labels) -> Floats:
+    """Distance (K,) from the camera on the ground, in metres."""
+    return np.hypot(labels.location[:, 0], labels.location[:, 2])
+
+
+def _outside(labels: Labels, level: Level) -> Mask:
+    distance = ground_distance(labels)
+    return (distance < level.distance[0]) | (distance >= level.distance[1])
+
+
+def select_truths(labels: Labels, name: str, level: Level) -> Mask:
+    """Which of the labels (K,) are to be found. One with just the minimum of height is not."""
+    height = labels.bbox[:, 3] - labels.bbox[:, 1]
+    hard = (labels.occlusion > level.max_occlusion) | (labels.truncation > level.max_truncation)
+    return (labels.name == name) & ~(hard | (height <= level.min_height) | _outside(labels, level))
+
+
+def clean_data(candidates: Candidates, name: str, metric: str, min_overlap: float, level: Level) -> Matching:
+    """The devkit's cleaning of the data for one class, metric, overlap and level."""
+    labels, detections = candidates.truths, candidates.detections
+    matchable = (labels.name == name) | (labels.name == NEIGHBOURS.get(name, name))
+    own = detections.name == name
+    # the devkit counts whole pixels here, and ignores a low detection of any class: it may hide a ground truth
+    height = np.trunc(np.abs(detections.bbox[:, 3] - detections.bbox[:, 1]))
+    ignored = (height < level.min_height) | (own & _outside(detections, level))
+    countable = own & ~ignored
+    if metric == "2d":
+        countable &= candidates.dontcare <= min_overlap
+    pairs = candidates.pairs[metric]
+    enough = pairs.overlap > min_overlap
+    pairs = pairs.select(enough & matchable[pairs.truth] & (own | ignored)[pairs.detection])
+    return Matching(pairs, select_truths(labels, name, level), ignored, countable)
+
+
+def count(matching: Matching, candidates: Candidates) -> Counts:
+    """The devkit's second pass, at every score a detection has."""
+    pairs, score = matching.pairs, candidates.score
+    alphas = candidates.truths.alpha, candidates.detections.alpha
+    masks = matching.truths, matching.ignored, matching.countable
+    changes = _changes(pairs.frame, pairs.truth, pairs.detection, pairs.overlap, score, *masks, *alphas)
+    lone = score[matching.countable]  # a false positive, until a change says that it is taken
+    scores, rows = np.unique(np.concatenate((changes[:, 0], lone)), return_inverse=True)
+
+    def running(values: Floats, rows: Integers) -> Floats:
+        return np.bincount(rows, values, minlength=len(scores))[::-1].cumsum()
+
+    true_positives, undecided, taken, similarity = (running(column, rows[: len(changes)]) for column in changes.T[1:])
+    return Counts(
+        score=scores[::-1],
+        true_positives=true_positives,
+        false_positives=running(np.ones(len(lone)), rows[len(changes) :]) - taken,
+        misses=matching.truths.sum() - true_positives - undecided,
+        similarity=similarity,
+    )
+
+
+def found_scores(matching: Matching, candidates: Candidates) -> Floats:
+    """The devkit's first pass: the scores (T,) of the true positives, highest first, when nothing is dropped.
+
+    Each ground truth in turn takes the best-scored of the detections left; the first of them where scores are equal.
+    """
+    pairs, score = matching.pairs, candidates.score
+    return np.sort(_found_scores(pairs.truth, pairs.detection, score, matching.truths, matching.ignored))[::-1]
+
+
+def match_at(matching: Matching, candidates: Candidates, threshold: float) -> tuple[Integers, Mask]:
+    """The detection of each ground truth (G,), -1 for none, without those below a score; and which are taken (D,)."""
+    pairs, score = matching.pairs, candidates.score
+    matched = np.full(len(candidates.truths), -1)
+    taken = np.zeros(len(candidates.detections), np.bool_)
+    arrays = pairs.truth, pairs.detection, pairs.overlap, score, matching.ignored
+    _assign(*arrays, 0, len(pairs.truth), threshold, matched, taken)
+    return matched, taken
+
+
+def _concatenate(frames: Sequence[Labels]) -> tuple[Labels, Integers]:
+    """The rows of all frames, and where each frame's begin (F + 1,)."""
+    starts = np.cumsum([0, *(len(frame) for frame in frames)])
+    columns: dict[str, Any] = {}
+    for field in fields(Labels):
+        parts = [getattr(frame, field.name) for frame in frames]
+        columns[field.name] = None if any(part is None for part in parts) else np.concatenate(parts)
+    return Labels(**columns), starts
+
+
+def _bev_boxes(labels: Labels) -> Floats:
+    """Boxes (K, 7) whose first two coordinates are the camera's x and z: its y points down, hence the minus."""
+    height, width, length = labels.dimensions.T
+    x, y, z = labels.location.T
+    return np.column_stack((x, z, y - height / 2, length, width, height, -labels.rotation_y))
+
+
+def _bev_bounds(boxes: Floats) -> Floats:
+    """Least x and y, greatest x and y (K, 4) of boxes (K, 7) in bird's eye view; a box without a size meets nothing."""
+    cos, sin = np.abs(np.cos(boxes[:, 6])), np.abs(np.sin(boxes[:, 6]))
+    half = np.column_stack((boxes[:, 3] * cos + boxes[:, 4] * sin, boxes[:, 3] * sin + boxes[:, 4] * cos)) / 2
+    half[(boxes[:, 3:5] <= 0).any(axis=1)] = -np.inf
+    return np.column_stack((boxes[:, :2] - half, boxes[:, :2] + half))
+
+
+def _vertical(labels: Labels, rows: Integers) -> tuple[Floats, Floats]:
+    """Top and bottom on the camera's y, which points down."""
+    bottom = labels.location[rows, 1]
+    return bottom - labels.dimensions[rows, 0], bottom
+
+
+@njit(cache=True, nogil=True)
+def _meeting(bounds_a: Floats, starts_a: Integers, bounds_b: Floats, starts_b: Integers) -> Integers:
+    """Frame, row in a, row in b (P, 3) of the bounds (., 4) in one frame whose interiors meet."""
+    found = np.empty((0, 3), np.int64)
+    for fill in (False, True):  # first count, then write
+        size = 0
+        for frame in range(len(starts_a) - 1):
+            for a in range(starts_a[frame], starts_a[frame + 1]):
+                for b in range(starts_b[frame], starts_b[frame + 1]):
+                    width = min(bounds_a[a, 2], bounds_b[b, 2]) - max(bounds_a[a, 0], bounds_b[b, 0])
+                    height = min(bounds_a[a, 3], bounds_b[b, 3]) - max(bounds_a[a, 1], bounds_b[b, 1])
+                    if width > 0 and height > 0:
+                        if fill:
+                            found[size] = frame, a, b
+                        size += 1
+        if not fill:
+            found = np.empty((size, 3), np.int64)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _found_scores(truth: Integers, detection: Integers, score: Floats, truths: Mask, ignored: Mask) -> Floats:
+    """The loop of `found_scores`: (T,), unsorted."""
+    taken = np.zeros(len(score), np.bool_)
+    found = np.empty(len(truth))
+    size = k = 0
+    while k < len(truth):
+        row, best = truth[k], -1
+        while k < len(truth) and truth[k] == row:
+            d = detection[k]
+            if not taken[d] and (best < 0 or score[d] > score[best]):
+                best = d
+            k += 1
+        if best >= 0:
+            taken[best] = True
+            if truths[row] and not ignored[best]:
+                found[size] = score[best]
+                size += 1
+    return found[:size]
+
+
+@njit(cache=True, nogil=True)
+def _assign(
+    truth: Integers,
+    detection: Integers,
+    overlap: Floats,
+    score: Floats,
+    ignored: Mask,
+    begin: int,
+    end: int,
+    threshold: float,
+    matched: Integers,
+    taken: Mask,
+) -> None:
+    """Writes to matched and taken the matching of the pairs from begin to end, without detections below the threshold.
+
+    Each ground truth in turn takes, of the detections left, the one with the greatest overlap; an ignored one only if
+    there is no other, and then the first.
+    """
+    k = begin
+    while k < end:
+        row, best, best_overlap = truth[k], -1, 0.0
+        while k < end and truth[k] == row:
+            d = detection[k]
+            if not taken[d] and score[d] >= threshold:
+                if ignored[d]:
+                    if best < 0:
+                        best = d
+                elif overlap[k] > best_overlap:
+                    best, best_overlap = d, overlap[k]
+            k += 1
+        matched[row] = best
+        if best >= 0:
+            taken[best] = True
+
+
+@njit(cache=True, nogil=True)
+def _changes(
+    frame: Integers,
+    truth: Integers,
+    detection: Integers,
+    overlap: Floats,
+    score: Floats,
+    truths: Mask,
+    ignored: Mask,
+    countable: Mask,
+    truth_alpha: Floats,
+    detection_alpha: Floats,
+) -> Floats:
+    """What changes where a threshold passes a score of a frame: (E, 5) float64.
+
+    The score, and the differences in true positives, in ground truths matched with an ignored detection, in countable
+    detections that are taken, and in similarity.
+    """
+    changes = np.empty((len(truth), 5))
+    matched = np.full(len(truths), -1)
+    taken = np.zeros(len(score), np.bool_)
+    size = begin = 0
+    while begin < len(truth):
+        end = begin
+        while end < len(truth) and frame[end] == frame[begin]:
+            end += 1
+        before = np.zeros(5)
+        for threshold in np.unique(score[detection[begin:end]])[::-1]:
+            taken[detection[begin:end]] = False
+            _assign(truth, detection, overlap, score, ignored, begin, end, threshold, matched, taken)
+            now = np.zeros(5)
+            for k in range(begin, end):
+                row = truth[k]
+                d = matched[row]
+                if d < 0 or (k > begin and truth[k - 1] == row):
+                    continue
+                if countable[d]:
+                    now[3] += 1
+                if truths[row] and ignored[d]:
+                    now[2] += 1
+                elif truths[row]:
+                    now[1] += 1
+                    now[4] += (1 + np.cos(truth_alpha[row] - detection_alpha[d])) / 2
+            changes[size] = now - before
+            changes[size, 0] = threshold
+            before = now
+            size += 1
+        begin = end
+    return changes[:size]

@@ -1,0 +1,152 @@
+"""HVNet: encoder, backbone and one head a class; `forward` returns maps, `detect` returns boxes."""
+
+import pickle
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from hvnet.anchors import assign_targets, decode, make_anchors
+from hvnet.backbone import Backbone
+from hvnet.cli import InputError
+from hvnet.config import Config, config_from_dict
+from hvnet.encoder import HybridVoxelEncoder
+from hvnet.head import Head, HeadMaps
+from hvnet.kernels.rotated import rotated_nms
+from hvnet.loss import class_loss
+
+
+class Detections(NamedTuple):
+    """Boxes of one cloud: class by class, within a class the best first."""
+
+    boxes: Tensor  # (M, 7)
+    scores: Tensor  # (M,)
+    labels: Tensor  # (M,) int64, index into config.head.classes
+
+
+class HVNet(nn.Module):
+    """The detector. A batch is all points (N, 4) of all samples in one tensor, and the sample (N,) of each point."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__()
+        self.config = config
+        self.encoder = HybridVoxelEncoder(config.encoder)
+        self.backbone = Backbone(config.backbone, config.encoder.image_channels, len(config.encoder.projection_scales))
+        channels = config.backbone.fusion_channels
+        self.heads = nn.ModuleList(Head(entry, channels, config.head.direction) for entry in config.head.classes)
+        for k, entry in enumerate(config.head.classes):
+            self.register_buffer(f"anchors_{k}", make_anchors(config, entry), persistent=False)
+        self.to(memory_format=torch.channels_last)
+
+    def anchors(self, label: int) -> Tensor:
+        """Anchors (A, 7) of a class."""
+        return self.get_buffer(f"anchors_{label}")
+
+    def forward(self, points: Tensor, sample: Tensor, batch_size: int) -> list[HeadMaps]:
+        """Points (N, 4) of samples (N,) to the maps of every class."""
+        images = self.encoder(points, sample, batch_size)
+        with torch.autocast(points.device.type, torch.bfloat16, enabled=self.config.train.bfloat16):
+            levels = self.backbone(images)
+            return [head(levels[entry.level]) for head, entry in zip(self.heads, self.config.head.classes, strict=True)]
+
+    def loss(self, maps: list[HeadMaps], boxes: list[Tensor], labels: list[Tensor]) -> dict[str, Tensor]:
+        """Eq. 5: the terms summed over classes, for the boxes (M_b, 7) and labels (M_b,) of every sample."""
+        total: dict[str, Tensor] = {}
+        for k, entry in enumerate(self.config.head.classes):
+            own = [b[at == k] for b, at in zip(boxes, labels, strict=True)]
+            targets = assign_targets(self.anchors(k), own, entry.positive_iou, entry.negative_iou)
+            for name, term in class_loss(maps[k], targets, entry, self.config.loss).items():
+                total[name] = total[name] + term if name in total else term
+        return total
+
+    @torch.no_grad()
+    def detect(self, points: Tensor, sample: Tensor, batch_size: int) -> list[Detections]:
+        """Boxes of every sample: scores above the threshold, then rotated NMS class by class."""
+        maps = self(points, sample, batch_size)
+        samples = []
+        for b in range(batch_size):
+            own = [HeadMaps(*(None if part is None else part[b] for part in of_class)) for of_class in maps]
+            parts = [self._detect_class(label, of_class) for label, of_class in enumerate(own)]
+            samples.append(Detections(*(torch.cat(column) for column in zip(*parts, strict=True))))
+        return samples
+
+    def _detect_class(self, label: int, maps: HeadMaps) -> Detections:
+        head = self.config.head
+        scores = maps.logits.sigmoid()
+        at = (scores > head.score_threshold).nonzero().squeeze(1)
+        best = torch.sort(scores[at], descending=True, stable=True).indices[: head.candidates]
+        at = at[best]
+        direction = None if maps.direction is None else maps.direction[at].argmax(dim=1)
+        boxes = decode(maps.corners[at], maps.vertical[at], direction, self.anchors(label)[at])
+        kept = rotated_nms(boxes, scores[at], head.classes[label].nms_iou)[: head.detections]
+        return Detections(boxes[kept], scores[at][kept], torch.full_like(kept, label))
+
+
+def save_checkpoint(path: Path, content: dict) -> None:
+    """Writes a checkpoint atomically: a stopped run leaves the old file or the new one, never half of one."""
+    partial = path.with_suffix(".partial")
+    torch.save(content, partial)
+    partial.replace(path)
+
+
+def load_checkpoint(path: str | Path) -> dict:
+    """Reads a checkpoint to the CPU (weights_only, so that it can run no code). Raises InputError naming the file."""
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such checkpoint; train one with python -m hvnet.train") from error
+    except (RuntimeError, pickle.UnpicklingError, EOFError, OSError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: truncated, or no checkpoint of hvnet.train; train again or copy it again") from error
+    if not isinstance(content, dict) or not {"config", "model"} <= content.keys():
+        raise InputError(f"{path}: no checkpoint of hvnet.train (it holds no config and model)")
+    return content
+
+
+def model_from_checkpoint(content: dict, source: str) -> HVNet:
+    """The model of what `load_checkpoint` read from source, in evaluation mode. Raises InputError naming source."""
+    model = HVNet(config_from_dict(content["config"], source))
+    try:
+        model.load_state_dict(content["model"])
+    except (RuntimeError, AttributeError, TypeError) as error:
+        raise InputError(f"{source}: its weights do not fit its config; train again with this version") from error
+    return model.eval()
+
+
+def select_device(name: str) -> torch.device:
+    """The device named auto, cpu or cuda (or cuda:1, ...); auto is CUDA where there is a GPU."""
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise InputError(f"--device {name}: torch sees no CUDA device; use --device cpu")
+    try:
+        return torch.device(name)
+    except RuntimeError as error:
+        raise InputError(f"--device {name}: want auto, cpu or cuda") from error
+
+
+class Detector:
+    """A trained model on a device: `detector(points)` gives the boxes of one cloud."""
+
+    def __init__(self, model: HVNet, device: torch.device) -> None:
+        self.model = model.to(device).eval()
+        self.device = device
+        self.classes = tuple(entry.name for entry in model.config.head.classes)
+
+    def __call__(self, points: Tensor | NDArray) -> Detections:
+        """Points (N, 4), x, y, z in metres and reflectance in [0, 1], to boxes (M, 7), scores (M,), labels (M,).
+
+        Points outside the range and points that are not finite take no part. Results lie on the detector's device.
+        """
+        cloud = torch.as_tensor(points, dtype=torch.float32, device=self.device)
+        if cloud.ndim != 2 or cloud.shape[1] != 4:
+            raise ValueError(f"points: want shape (N, 4) with x, y, z, reflectance, got {tuple(cloud.shape)}")
+        sample = torch.zeros(len(cloud), dtype=torch.int64, device=self.device)
+        return self.model.detect(cloud, sample, 1)[0]
+
+
+def load(checkpoint: str | Path, device: str = "auto") -> Detector:
+    """A detector from a checkpoint of `python -m hvnet.train`. Raises InputError naming the file."""
+    model = model_from_checkpoint(load_checkpoint(checkpoint), str(checkpoint))
+    return Detector(model, select_device(device))

@@ -1,0 +1,329 @@
+"""Training, from top to bottom: `python -m hvnet.train`. Without arguments it trains the demo on generated scenes."""
+
+import argparse
+import json
+import math
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from hvnet.cli import InputError, run_command
+from hvnet.config import Config, TrainConfig, config_to_dict, load_config
+from hvnet.data.augment import augment
+from hvnet.data.database import FILE_NAME, Database, build_database, read_database, write_database
+from hvnet.data.kitti import Frame, detections_to_labels, read_frame, read_split
+from hvnet.data.synthetic import generate
+from hvnet.draw import draw_bev
+from hvnet.evaluate import evaluate, format_table
+from hvnet.model import HVNet, load_checkpoint, save_checkpoint, select_device
+
+DEMO = Path(__file__).resolve().parent.parent / "configs" / "demo.yaml"
+
+
+class Batch(NamedTuple):
+    """Several frames in one: all points, the sample of each, and the boxes of every sample."""
+
+    points: Tensor  # (N, 4)
+    sample: Tensor  # (N,) int64
+    boxes: list[Tensor]  # (M_b, 7) each
+    labels: list[Tensor]  # (M_b,) int64 each, index into the config's classes
+
+    def to(self, device: torch.device) -> "Batch":
+        """The batch on a device."""
+        boxes, labels = [b.to(device) for b in self.boxes], [at.to(device) for at in self.labels]
+        return Batch(self.points.to(device), self.sample.to(device), boxes, labels)
+
+
+class TrainingFrames(Dataset[tuple[Tensor, Tensor, Tensor]]):
+    """The frames of a split, augmented; item (epoch, k) depends on the seed, the epoch and k alone."""
+
+    def __init__(self, root: Path, ids: list[str], config: Config, database: Database | None) -> None:
+        self.root, self.ids, self.config, self.database = root, ids, config, database
+        self.classes = [entry.name for entry in config.head.classes]
+        self.kept: dict[int, Frame] = {}
+
+    def __getitem__(self, item: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+        epoch, k = item
+        frame = self.kept.get(k) or read_frame(self.root, self.ids[k])
+        if self.config.train.workers == 0:  # read once; several workers would each keep all frames
+            self.kept[k] = frame
+        labels = torch.tensor([self.classes.index(n) if n in self.classes else -1 for n in frame.names]).long()
+        generator = seeded(self.config.train.seed, epoch, k)
+        points, boxes, labels = augment(
+            frame.points, frame.boxes, labels, self.database, self.config.augment, generator, self.classes
+        )
+        low, high = boxes.new_tensor(self.config.encoder.point_range).view(2, 3)
+        inside = ((boxes[:, :2] >= low[:2]) & (boxes[:, :2] < high[:2])).all(dim=1) & (labels >= 0)
+        return points, boxes[inside], labels[inside]
+
+
+class EpochOrder(Sampler[tuple[int, int]]):
+    """The items (epoch, k) of an epoch, shuffled by seed and epoch."""
+
+    def __init__(self, count: int, seed: int) -> None:
+        self.count, self.seed, self.epoch = count, seed, 0
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        order = torch.randperm(self.count, generator=seeded(self.seed, self.epoch)).tolist()
+        return iter([(self.epoch, k) for k in order])
+
+
+def seeded(*numbers: int) -> torch.Generator:
+    """A generator that depends on all of the numbers and on nothing else."""
+    seed = 0
+    for number in numbers:
+        seed = (seed * 6364136223846793005 + number + 1442695040888963407) % 2**63
+    return torch.Generator().manual_seed(seed)
+
+
+def collate(samples: Sequence[tuple[Tensor, Tensor, Tensor]]) -> Batch:
+    """Joins samples into a batch."""
+    points, boxes, labels = zip(*samples, strict=True)
+    sample = torch.repeat_interleave(torch.arange(len(points)), torch.tensor([len(p) for p in points]))
+    return Batch(torch.cat(points), sample, list(boxes), list(labels))
+
+
+def learning_rate(config: TrainConfig, step: int, epoch: int) -> float:
+    """Linear warm-up from warmup_ratio times the rate, then a decay at each of decay_epochs (Sec. 4.1)."""
+    decayed = config.learning_rate * config.decay_ratio ** sum(epoch >= at for at in config.decay_epochs)
+    if step < config.warmup_steps:
+        return decayed * (config.warmup_ratio + (1 - config.warmup_ratio) * step / config.warmup_steps)
+    return decayed
+
+
+def train_epoch(
+    model: HVNet, optimizer: torch.optim.Optimizer, loader: DataLoader, epoch: int, step: int, device: torch.device
+) -> tuple[dict[str, float], int]:
+    """One epoch from a step on; returns the mean of every loss and the step that comes next."""
+    config = model.config.train
+    model.train()
+    sums: dict[str, Tensor] = {}
+    count = 0
+    bar = tqdm(loader, desc=f"epoch {epoch + 1}/{config.epochs}", unit="batch", leave=False, dynamic_ncols=True)
+    for batch in bar:
+        for group in optimizer.param_groups:
+            group["lr"] = learning_rate(config, step, epoch)
+        batch = batch.to(device)
+        terms = model.loss(model(batch.points, batch.sample, len(batch.boxes)), batch.boxes, batch.labels)
+        loss = torch.stack(list(terms.values())).sum()
+        if not math.isfinite(loss.item()):
+            raise InputError(f"the loss is {loss.item()} at step {step}; lower train.learning_rate and --resume")
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), config.gradient_clip)
+        optimizer.step()
+        step, count = step + 1, count + 1
+        for name, term in {"loss": loss, **terms}.items():
+            sums[name] = sums.get(name, torch.zeros((), device=device)) + term.detach()
+        bar.set_postfix(loss=f"{loss.item():.3f}", frames=f"{config.batch_size * (bar.format_dict['rate'] or 0):.1f}/s")
+    return {name: total.item() / count for name, total in sums.items()}, step
+
+
+def validate(
+    model: HVNet, root: Path, ids: list[str], device: torch.device, pictures: Path
+) -> dict[str, dict[str, Any]]:
+    """Detects in the frames of a split and scores the boxes as KITTI does; draws the first few into a folder."""
+    classes = [entry.name for entry in model.config.head.classes]
+    model.eval()
+    labels, predictions = [], []
+    for k, name in enumerate(tqdm(ids, desc="validating", unit="frame", leave=False, dynamic_ncols=True)):
+        frame = read_frame(root, name)
+        points = frame.points.to(device)
+        sample = torch.zeros(len(points), dtype=torch.int64, device=device)
+        found = model.detect(points, sample, 1)[0]
+        names = [classes[label] for label in found.labels.tolist()]
+        labels.append(frame.labels)
+        predictions.append(detections_to_labels(found.boxes, found.scores, names, frame.calib, frame.image_size))
+        if k < model.config.train.pictures:
+            truth = frame.boxes[[n in classes for n in frame.names]]
+            point_range = model.config.encoder.point_range
+            draw_bev(pictures / f"{name}.png", frame.points, point_range, truth, *found, classes, f"frame {name}")
+    return evaluate(labels, predictions, classes=classes)
+
+
+def train(config: Config, root: Path, out: Path, device: torch.device, resume: bool) -> None:
+    """Trains on a KITTI root, validates, and writes checkpoint.pt, metrics.jsonl, tensorboard/ and pictures/."""
+    make_deterministic(config.train.seed)
+    train_ids = read_split(root, config.train.train_split)
+    val_ids = read_split(root, config.train.val_split)
+    database = load_database(root, config) if config.augment.objects else None
+    order = EpochOrder(len(train_ids), config.train.seed)
+    loader: DataLoader = DataLoader(
+        TrainingFrames(root, train_ids, config, database),
+        batch_size=config.train.batch_size,
+        sampler=order,
+        collate_fn=collate,
+        drop_last=len(train_ids) >= config.train.batch_size,
+        num_workers=config.train.workers,
+        persistent_workers=config.train.workers > 0,
+        # a forked worker would inherit Warp, CUDA and the threads of this process
+        multiprocessing_context="spawn" if config.train.workers else None,
+    )
+    model = HVNet(config).to(device)
+    optimizer = torch.optim.Adam(
+        model.parameters(), lr=config.train.learning_rate, weight_decay=config.train.weight_decay
+    )
+    first_epoch, step = restore(out / "checkpoint.pt", model, optimizer) if resume else (0, 0)
+    print(f"{len(train_ids)} frames to train, {len(val_ids)} to validate, on {device}; the run is {out}", flush=True)
+
+    metrics = keep_metrics(out / "metrics.jsonl", first_epoch)
+    board = SummaryWriter(str(out / "tensorboard"), purge_step=first_epoch)
+    for epoch in range(first_epoch, config.train.epochs):
+        order.epoch = epoch
+        losses, step = train_epoch(model, optimizer, loader, epoch, step, device)
+        print(
+            f"epoch {epoch + 1:3d}  " + "  ".join(f"{name} {value:.6f}" for name, value in losses.items()), flush=True
+        )
+        record: dict[str, Any] = {"epoch": epoch + 1, "step": step, **losses}
+        last = epoch + 1 == config.train.epochs
+        if last or (epoch + 1) % config.train.validate_every == 0:
+            scores = validate(model, root, val_ids, device, out / "pictures")
+            print(format_table(scores), flush=True)
+            record["validation"] = {
+                name: {measure: table[measure] for measure in ("R40", "exact")} for name, table in scores.items()
+            }
+        for name, value in flatten(record):
+            board.add_scalar(name, value, epoch + 1)
+        content = {
+            "config": config_to_dict(config),
+            "model": model.state_dict(),
+            "optimizer": optimizer.state_dict(),
+            "epoch": epoch + 1,
+            "step": step,
+            "random": torch.get_rng_state(),
+        }
+        with metrics.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(record) + "\n")
+        save_checkpoint(out / "checkpoint.pt", content)
+    board.close()
+    print(f"checkpoint: {out / 'checkpoint.pt'}\npictures:   {out / 'pictures'}")
+
+
+def load_database(root: Path, config: Config) -> Database:
+    """The root's ground-truth database; it is built, and kept there if that can be written, where there is none."""
+    path = root / FILE_NAME
+    if path.is_file():
+        return read_database(path)
+    database = build_database(root, config.train.train_split)
+    try:
+        write_database(path, database)
+    except OSError as error:
+        print(f"{path}: not kept ({error.strerror}); it will be built again")
+    return database
+
+
+def make_deterministic(seed: int) -> None:
+    """Seeds torch, and asks of it the same bits on every run."""
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    torch.manual_seed(seed)
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    torch.utils.deterministic.fill_uninitialized_memory = False
+    torch.backends.cudnn.benchmark = False
+
+
+def restore(path: Path, model: HVNet, optimizer: torch.optim.Optimizer) -> tuple[int, int]:
+    """Takes up a run where its checkpoint left it; returns the epochs and steps done."""
+    content = load_checkpoint(path)
+    here = config_to_dict(model.config)
+    changed = sorted(key for key, _ in set(_leaves(content["config"])) ^ set(_leaves(here)))
+    changed = [key for key in changed if key not in ("train.epochs", "train.learning_rate")]
+    if changed:
+        raise InputError(f"{path}: was trained with another {changed[0]}; give its config, or another --out")
+    try:
+        model.load_state_dict(content["model"])
+        optimizer.load_state_dict(content["optimizer"])
+        torch.set_rng_state(content["random"])
+        return int(content["epoch"]), int(content["step"])
+    except (KeyError, RuntimeError, ValueError, TypeError) as error:
+        raise InputError(f"{path}: does not hold a whole run ({error}); start anew with another --out") from error
+
+
+def _leaves(tree: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """The values of a config with their dotted keys."""
+    if isinstance(tree, dict):
+        for name, value in tree.items():
+            yield from _leaves(value, f"{key}.{name}" if key else name)
+    else:
+        yield key, json.dumps(tree)
+
+
+def flatten(record: Any, key: str = "") -> Iterator[tuple[str, float]]:
+    """The numbers of a nested record with their paths, as TensorBoard names them."""
+    if isinstance(record, dict):
+        for name, value in record.items():
+            yield from flatten(value, f"{key}/{name}" if key else name)
+    elif isinstance(record, list):
+        for name, value in zip(("easy", "moderate", "hard"), record, strict=False):
+            yield from flatten(value, f"{key}/{name}")
+    elif record is not None:
+        yield key, float(record)
+
+
+def keep_metrics(path: Path, epochs: int) -> Path:
+    """Leaves the lines of the epochs that are done: a run may have stopped after a line, before its checkpoint."""
+    if path.is_file():
+        lines = path.read_text(encoding="utf-8").splitlines()
+        kept = [line for line in lines if line.endswith("}") and json.loads(line)["epoch"] <= epochs]
+        path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+    return path
+
+
+def choose_out(given: str | None, config: Path, resume: bool) -> Path:
+    """The run's folder: the one given, or runs/NAME, runs/NAME-2, ... after the config."""
+    if given is not None:
+        out = Path(given)
+    else:
+        names = [Path("runs") / (config.stem if k == 1 else f"{config.stem}-{k}") for k in range(1, 10_000)]
+        free = next(k for k, path in enumerate(names) if not path.exists())
+        out = names[max(free - 1, 0) if resume else free]
+    if resume and not (out / "checkpoint.pt").is_file():
+        raise InputError(f"{out}: holds no checkpoint.pt to resume; give the run's folder with --out, or no --resume")
+    if not resume and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: is not empty; give another --out, or --resume to go on with the run in it")
+    return out
+
+
+def main(arguments: Sequence[str] | None) -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(
+        prog="python -m hvnet.train",
+        description="Trains HVNet, validates it as KITTI does, and writes a checkpoint, metrics and pictures.",
+        epilog="examples:\n  python -m hvnet.train\n"
+        "  python -m hvnet.train --config configs/compact.yaml --data /data/kitti --set train.batch_size=2\n"
+        "  python -m hvnet.train --out runs/demo --resume",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--config", type=Path, default=DEMO, metavar="FILE", help="YAML (default: configs/demo.yaml)")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="a KITTI root (default: scenes are generated)")
+    parser.add_argument("--out", metavar="DIR", help="folder of the run (default: runs/NAME of the config)")
+    parser.add_argument("--resume", action="store_true", help="go on with the run in --out (default: the latest)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override a config value")
+    options = parser.parse_args(arguments)
+
+    config = load_config(options.config, options.set)
+    device = select_device(options.device)
+    out = choose_out(options.out, options.config, options.resume)
+    root = options.data
+    if root is None:
+        if config.synthetic is None:
+            raise InputError(f"{options.config}: has no key synthetic, so it needs --data with a KITTI root")
+        scenes = config.synthetic
+        root = out.parent / f"scenes-{scenes.train_frames}-{scenes.val_frames}-{config.train.seed}"
+        generate(root, scenes.train_frames, scenes.val_frames, config.train.seed)
+    out.mkdir(parents=True, exist_ok=True)
+    train(config, root, out, device, options.resume)
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,103 @@
+"""Box geometry against hand-made tables and shapely's polygons."""
+
+import math
+
+import pytest
+import torch
+from shapely.geometry import Polygon
+
+from hvnet.boxes import bev_corners, box_corners, boxes_collide, limit_angle, points_in_boxes
+
+ANGLES = [
+    (0.0, 0.0),
+    (math.pi, -math.pi),
+    (-math.pi, -math.pi),
+    (3 * math.pi, -math.pi),
+    (math.pi / 2, math.pi / 2),
+    (1.5 * math.pi, -math.pi / 2),
+    (-1.5 * math.pi, math.pi / 2),
+    (7 * math.pi + 1, 1 - math.pi),
+]
+
+
+def random_boxes(count: int, seed: int, spread: float) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    boxes = torch.rand(count, 7, generator=generator, dtype=torch.float64)
+    boxes[:, :3] = (boxes[:, :3] - 0.5) * spread
+    boxes[:, 3:6] = boxes[:, 3:6] * 5 + 0.1
+    boxes[:, 6] = (boxes[:, 6] - 0.5) * 2 * math.pi
+    return boxes
+
+
+@pytest.mark.parametrize(("angle", "wrapped"), ANGLES)
+def test_limit_angle(angle: float, wrapped: float) -> None:
+    torch.testing.assert_close(
+        limit_angle(torch.tensor(angle, dtype=torch.float64)), torch.tensor(wrapped, dtype=torch.float64)
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_limit_angle_is_half_open(dtype: torch.dtype) -> None:
+    pi = torch.tensor(math.pi, dtype=dtype)
+    edges = torch.stack([pi, -pi, pi.nextafter(pi + 1), (-pi).nextafter(-pi - 1), pi.nextafter(pi - 1), -pi - 1e-30])
+    tiny = torch.tensor([-1e-30, -1e-8, 1e-30, 0.0, -0.0], dtype=dtype)
+    wrapped = limit_angle(torch.cat((edges, tiny)))
+    assert (wrapped >= -math.pi).all()
+    assert (wrapped < math.pi).all()
+    assert (wrapped[-5:].abs() < 1e-6).all()
+
+
+def test_corners_are_front_left_front_right_rear_right_rear_left() -> None:
+    box = torch.tensor([[10.0, 5.0, 1.0, 4.0, 2.0, 1.5, 0.0]])
+    assert bev_corners(box).tolist() == [[[12, 6], [12, 4], [8, 4], [8, 6]]]
+    corners = box_corners(box)
+    assert corners[0, :4, :2].tolist() == corners[0, 4:, :2].tolist() == [[12, 6], [12, 4], [8, 4], [8, 6]]
+    assert corners[0, :, 2].tolist() == [0.25] * 4 + [1.75] * 4
+
+
+def test_corners_turn_to_the_left() -> None:
+    box = torch.tensor([10.0, 5.0, 1.0, 4.0, 2.0, 1.5, math.pi / 2])
+    expected = torch.tensor([[9.0, 7], [11, 7], [11, 3], [9, 3]])
+    torch.testing.assert_close(bev_corners(box), expected)
+
+
+def test_points_in_boxes_counts_the_faces() -> None:
+    box = torch.tensor([[0.0, 0.0, 0.0, 4.0, 2.0, 1.0, 0.0]])
+    points = torch.tensor([[2.0, 1, 0.5], [-2, -1, -0.5], [2.01, 0, 0], [0, 1.01, 0], [0, 0, 0.51], [0, 0, 0]])
+    assert points_in_boxes(points, box)[:, 0].tolist() == [True, True, False, False, False, True]
+
+
+def test_points_in_boxes_agrees_with_the_corners() -> None:
+    """A point is inside iff it is a combination of the box's edges with shares between 0 and 1."""
+    boxes = random_boxes(20, seed=0, spread=4)
+    points = (torch.rand(500, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 0.5) * 8
+    corners = box_corners(boxes)
+    origin = corners[:, 2]
+    edges = torch.stack((corners[:, 1] - origin, corners[:, 3] - origin, corners[:, 6] - origin), dim=-1)
+    shares = torch.linalg.solve(edges[None], (points[:, None] - origin[None])[..., None])[..., 0]
+    expected = ((shares >= 0) & (shares <= 1)).all(-1)
+    assert expected.sum() > 50
+    assert torch.equal(points_in_boxes(points, boxes), expected)
+
+
+def test_points_in_boxes_of_nothing() -> None:
+    assert points_in_boxes(torch.zeros(0, 4), torch.zeros(3, 7)).shape == (0, 3)
+    assert points_in_boxes(torch.zeros(5, 4), torch.zeros(0, 7)).shape == (5, 0)
+
+
+def test_boxes_collide_as_polygons_overlap() -> None:
+    a, b = random_boxes(40, seed=2, spread=12), random_boxes(30, seed=3, spread=12)
+    polygons_a, polygons_b = ([Polygon(corners.tolist()) for corners in bev_corners(boxes)] for boxes in (a, b))
+    expected = torch.tensor([[p.intersection(q).area > 1e-9 for q in polygons_b] for p in polygons_a])
+    assert 0.1 < expected.double().mean() < 0.9
+    assert torch.equal(boxes_collide(a, b), expected)
+    assert torch.equal(boxes_collide(b, a), expected.T)
+
+
+def test_boxes_that_touch_do_not_collide() -> None:
+    box = torch.tensor([[0.0, 0, 0, 4, 2, 1, 0]])
+    others = torch.tensor(
+        [[4.0, 0, 0, 4, 2, 1, 0], [3.99, 0, 0, 4, 2, 1, 0], [0, 2, 9, 4, 2, 1, 0], [0, 0, 9, 1, 1, 1, 1]]
+    )
+    assert boxes_collide(box, others).tolist() == [[False, True, False, True]]
+    assert boxes_collide(box, others[:0]).shape == (1, 0)

@@ -1,0 +1,414 @@
+"""KITTI's files: what is read, what is written back, the conversions between axes, and what is refused."""
+
+import dataclasses
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from hvnet.boxes import points_in_boxes
+from hvnet.cli import InputError
+from hvnet.data.kitti import (
+    Calibration,
+    Labels,
+    boxes_to_camera,
+    boxes_to_lidar,
+    detections_to_labels,
+    drop_non_finite,
+    in_image,
+    project_boxes,
+    read_calibration,
+    read_frame,
+    read_labels,
+    read_points,
+    read_split,
+    write_calibration,
+    write_labels,
+    write_points,
+)
+
+SIZE = (1242, 375)
+CAR = "Car 0.25 1 -1.50 100.00 120.50 300.25 240.75 1.50 1.60 4.00 2.00 1.70 10.00 -1.30"
+DONT_CARE = "DontCare -1 -1 -10 800.38 163.67 825.45 184.07 -1 -1 -1 -1000 -1000 -1000 -10"
+
+# a camera at the LiDAR's origin that looks along +x: camera x = -y, camera y = -z, camera z = x
+PLAIN = Calibration(
+    p2=np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]]),
+    r0_rect=np.eye(3),
+    velo_to_cam=np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]]),
+)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A KITTI root with frames 000000 and 000001, one labelled car and one DontCare each."""
+    for folder in ("velodyne", "calib", "label_2", "image_2"):
+        (tmp_path / "training" / folder).mkdir(parents=True)
+    (tmp_path / "ImageSets").mkdir()
+    (tmp_path / "ImageSets" / "train.txt").write_text("000000\n000001\n")
+    points = np.array([[10, 0, 0, 0.5], [-10, 0, 0, 0.5], [10, 20, 0, 0.5], [np.nan, 0, 0, 0.5]], dtype=np.float32)
+    for frame_id in ("000000", "000001"):
+        write_points(tmp_path / "training" / "velodyne" / f"{frame_id}.bin", points)
+        write_calibration(tmp_path / "training" / "calib" / f"{frame_id}.txt", PLAIN)
+        (tmp_path / "training" / "label_2" / f"{frame_id}.txt").write_text(f"{CAR}\n{DONT_CARE}\n")
+    return tmp_path
+
+
+def overlap_2d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """IoU of 2D boxes (K, 4), row by row."""
+    common = (np.minimum(a[:, 2:], b[:, 2:]) - np.maximum(a[:, :2], b[:, :2])).clip(0).prod(axis=1)
+    return common / ((a[:, 2:] - a[:, :2]).prod(axis=1) + (b[:, 2:] - b[:, :2]).prod(axis=1) - common)
+
+
+def test_read_labels(tmp_path: Path) -> None:
+    path = tmp_path / "000000.txt"
+    path.write_text(f"{CAR}\n\n{DONT_CARE}\n")
+    labels = read_labels(path)
+    assert len(labels) == 2
+    assert labels.name.tolist() == ["Car", "DontCare"]
+    assert labels.truncation.tolist() == [0.25, -1]
+    assert labels.occlusion.tolist() == [1, -1]
+    assert labels.alpha.tolist() == [-1.5, -10]
+    assert labels.bbox[0].tolist() == [100, 120.5, 300.25, 240.75]
+    assert labels.dimensions[0].tolist() == [1.5, 1.6, 4]
+    assert labels.location[0].tolist() == [2, 1.7, 10]
+    assert labels.rotation_y.tolist() == [-1.3, -10]
+    assert labels.score is None
+    assert labels.select(labels.name == "Car").name.tolist() == ["Car"]
+
+
+def test_read_scored_labels(tmp_path: Path) -> None:
+    path = tmp_path / "000000.txt"
+    path.write_text(f"{CAR} 0.75\n")
+    score = read_labels(path, scored=True).score
+    assert score is not None
+    assert score.tolist() == [0.75]
+
+
+@pytest.mark.parametrize("scored", [False, True])
+def test_empty_label_file_means_no_objects(tmp_path: Path, scored: bool) -> None:
+    path = tmp_path / "000000.txt"
+    path.write_text("")
+    labels = read_labels(path, scored)
+    assert len(labels) == 0
+    assert labels.bbox.shape == (0, 4)
+    assert boxes_to_lidar(labels, PLAIN).shape == (0, 7)
+    write_labels(path, labels)
+    assert path.read_text() == ""
+
+
+BAD_LABELS = [
+    (CAR.rsplit(" ", 1)[0], False, "14 fields, expected 15"),
+    (f"{CAR} 0.5", False, "16 fields, expected 15"),
+    (CAR, True, "15 fields, expected 16"),
+    (CAR.replace("10.00", "ten"), False, "field 14 is 'ten', not a finite number"),
+    (CAR.replace("10.00", "nan"), False, "field 14 is 'nan', not a finite number"),
+    (f"{CAR} inf", True, "field 16 is 'inf', not a finite number"),
+    (CAR.replace("0.25 1 ", "0.25 1.5 "), False, "field 3 is '1.5', not a whole number"),
+    (CAR.replace("1.60 4.00", "0.00 4.00"), False, "height, width or length (fields 9 to 11) is not positive"),
+    (CAR.replace("Car", "Lorry"), False, "unknown class 'Lorry'; known are Car, Van"),
+]
+
+
+@pytest.mark.parametrize(("line", "scored", "message"), BAD_LABELS)
+def test_bad_label_line_is_named(tmp_path: Path, line: str, scored: bool, message: str) -> None:
+    path = tmp_path / "000007.txt"
+    path.write_text(f"{CAR}{' 0.5' if scored else ''}\n\n{line}\n")
+    with pytest.raises(InputError, match=re.escape(f"{path}:3: {message}")):
+        read_labels(path, scored)
+
+
+def test_missing_or_binary_label_file_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "000007.txt"
+    with pytest.raises(InputError, match=re.escape(f"{path}: no such file")):
+        read_labels(path)
+    path.write_bytes(b"\xff\xfe\x80")
+    with pytest.raises(InputError, match=re.escape(f"{path}: not a text file")):
+        read_labels(path)
+    with pytest.raises(InputError, match=re.escape(f"{tmp_path}: cannot be read")):
+        read_labels(tmp_path)
+
+
+def test_labels_are_written_as_they_were_read(tmp_path: Path) -> None:
+    path = tmp_path / "000000.txt"
+    path.write_text(f"{CAR}\n{DONT_CARE}\n")
+    write_labels(tmp_path / "copy.txt", read_labels(path))
+    assert (tmp_path / "copy.txt").read_text() == path.read_text()
+
+
+def test_result_files_keep_their_digits(tmp_path: Path) -> None:
+    path = tmp_path / "000000.txt"
+    line = "Car -1 -1 -1.2346 100.1234 120.5678 300.2512 240.7578 1.5012 1.6034 4.0056 2.0078 1.7012 10.1234 -1.3012"
+    path.write_text(f"{line} 0.123457\n")
+    write_labels(tmp_path / "copy.txt", read_labels(path, scored=True))
+    assert (tmp_path / "copy.txt").read_text() == path.read_text()
+
+
+def test_calibration_round_trip(tmp_path: Path) -> None:
+    path = tmp_path / "000000.txt"
+    write_calibration(path, PLAIN)
+    keys = [line.split(":")[0] for line in path.read_text().splitlines()]
+    assert keys == ["P0", "P1", "P2", "P3", "R0_rect", "Tr_velo_to_cam", "Tr_imu_to_velo"]
+    copy = read_calibration(path)
+    for field in dataclasses.fields(Calibration):
+        assert np.array_equal(getattr(copy, field.name), getattr(PLAIN, field.name))
+
+
+BAD_CALIBRATION = [
+    ("P2: 1 2 3", "4: P2 has 3 numbers, expected 12"),
+    ("R0_rect: 1 0 0 0 1 0 0 0 one", "4: R0_rect holds 'one', not a finite number"),
+    ("R0_rect: 1 0 0 0 1 0 0 0 nan", "4: R0_rect holds 'nan', not a finite number"),
+    ("R0_rect: 0 0 0 0 0 0 0 0 0", "4: R0_rect is no rotation"),
+    ("Tr_velo_to_cam: 0 0 0 1 0 0 0 1 0 0 0 1", "4: Tr_velo_to_cam is no rotation"),
+    ("P2: 700 0 600 0 0 700 180 0 0 0 1 0\nP2: 700 0 600 0 0 700 180 0 0 0 1 0", "5: P2 stands there twice"),
+    ("", " no line 'P2: ...'"),
+]
+
+
+@pytest.mark.parametrize(("lines", "message"), BAD_CALIBRATION)
+def test_bad_calibration_is_named(tmp_path: Path, lines: str, message: str) -> None:
+    path = tmp_path / "000007.txt"
+    write_calibration(path, PLAIN)
+    key = lines.split(":")[0] or "P2"
+    kept = [line for line in path.read_text().splitlines() if not line.startswith(key)]
+    path.write_text("\n".join([*kept[:3], lines, *kept[3:]]) + "\n")
+    with pytest.raises(InputError, match=re.escape(f"{path}:{message}")):
+        read_calibration(path)
+
+
+def test_missing_calibration_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=re.escape(f"{tmp_path / '000007.txt'}: no such file")):
+        read_calibration(tmp_path / "000007.txt")
+
+
+def test_axes() -> None:
+    xyz = np.array([[10.0, 2, -1]])
+    assert PLAIN.to_camera(xyz).tolist() == [[-2, 1, 10]]
+    assert PLAIN.to_lidar(np.array([[-2.0, 1, 10]])).tolist() == [[10, 2, -1]]
+    uv, depth = PLAIN.project(xyz)
+    np.testing.assert_allclose(uv, [[600 - 140, 180 + 70]])
+    assert depth.tolist() == [10]
+
+
+def test_points_round_trip(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
+    write_points(tmp_path / "a.bin", points[::2])
+    assert np.array_equal(read_points(tmp_path / "a.bin"), points[::2])
+    write_points(tmp_path / "b.bin", points[:0])
+    assert read_points(tmp_path / "b.bin").shape == (0, 4)
+
+
+def test_cut_off_points_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "000007.bin"
+    path.write_bytes(bytes(33))
+    with pytest.raises(InputError, match=re.escape(f"{path}: 33 bytes are no multiple of 16")):
+        read_points(path)
+    with pytest.raises(InputError, match=re.escape(f"{tmp_path / 'none.bin'}: cannot be read")):
+        read_points(tmp_path / "none.bin")
+
+
+def test_non_finite_points_are_dropped_and_counted() -> None:
+    points = np.zeros((5, 4), np.float32)
+    assert drop_non_finite(points) == (points, 0)
+    points[1, 3], points[2, 0], points[4, 2] = np.nan, np.inf, -np.inf
+    kept, dropped = drop_non_finite(points)
+    assert kept.shape == (2, 4)
+    assert dropped == 3
+
+
+def test_boxes_to_lidar() -> None:
+    labels = Labels(
+        name=np.array(["Car", "Car"]),
+        truncation=np.zeros(2),
+        occlusion=np.zeros(2, np.int64),
+        alpha=np.zeros(2),
+        bbox=np.zeros((2, 4)),
+        dimensions=np.array([[1.5, 1.6, 4.0], [1.5, 1.6, 4.0]]),
+        location=np.array([[-2.0, 1.7, 10.0], [0.0, 1.7, 10.0]]),
+        rotation_y=np.array([-math.pi / 2, math.pi / 2]),  # away from the camera, towards it
+    )
+    boxes = boxes_to_lidar(labels, PLAIN)
+    expected = [[10, 2, -1.7 + 0.75, 4, 1.6, 1.5, 0], [10, 0, -1.7 + 0.75, 4, 1.6, 1.5, -math.pi]]
+    np.testing.assert_allclose(boxes, expected, atol=1e-12)
+
+
+def test_box_conversions_are_inverse_to_each_other(kitti_root: Path) -> None:
+    calib = read_calibration(kitti_root / "training" / "calib" / "000008.txt")
+    random = np.random.default_rng(0)
+    boxes = random.uniform(-1, 1, (200, 7)) * [50, 50, 3, 4, 4, 4, math.pi]
+    boxes[:, 3:6] = abs(boxes[:, 3:6]) + 0.1
+    boxes[:3, 6] = -math.pi, 0, math.nextafter(math.pi, 0)
+    dimensions, location, rotation_y = boxes_to_camera(boxes, calib)
+    zeros = np.zeros(200)
+    labels = Labels(
+        np.full(200, "Car"), zeros, zeros.astype(int), zeros, np.zeros((200, 4)), dimensions, location, rotation_y
+    )
+    back = boxes_to_lidar(labels, calib)
+    np.testing.assert_allclose(back[:, :6], boxes[:, :6], atol=1e-9)
+    np.testing.assert_allclose(np.exp(1j * back[:, 6]), np.exp(1j * boxes[:, 6]), atol=1e-12)
+    assert (rotation_y >= -math.pi).all()
+    assert (rotation_y < math.pi).all()
+
+
+# boxes in PLAIN's view, where u = 600 - 700 y / x and v = 180 - 700 z / x
+PROJECTED: dict[str, tuple[list[float], list[float] | None]] = {
+    "ahead": ([20, 0, 0, 4, 2, 2, 0], [600 - 700 / 18, 180 - 700 / 18, 600 + 700 / 18, 180 + 700 / 18]),
+    "cut by the left edge": ([10, 9, 0, 2, 2, 2, 0], [0, 180 - 700 / 9, 600 - 700 * 8 / 11, 180 + 700 / 9]),
+    "around the camera": ([0, 0, 0, 8, 2, 2, 0], [0, 0, 1241, 374]),
+    "half behind, to the left": ([0, 5, 0, 40, 2, 2, 0], [0, 0, 600 - 700 * 4 / 20, 374]),
+    "behind": ([-20, 0, 0, 4, 2, 2, 0], None),
+    "beside the image": ([10, 20, 0, 2, 2, 2, 0], None),
+    "above the image": ([10, 0, 20, 2, 2, 2, 0], None),
+}
+
+
+@pytest.mark.parametrize("name", PROJECTED)
+def test_project_boxes(name: str) -> None:
+    box, expected = PROJECTED[name]
+    bbox, visible = project_boxes(np.array([box], dtype=np.float64), PLAIN, SIZE)
+    assert visible.tolist() == [expected is not None]
+    np.testing.assert_allclose(bbox, [expected or [0] * 4], atol=1e-9)
+
+
+def test_project_no_boxes() -> None:
+    bbox, visible = project_boxes(np.zeros((0, 7)), PLAIN, SIZE)
+    assert bbox.shape == (0, 4)
+    assert visible.shape == (0,)
+
+
+def test_in_image() -> None:
+    pixels = [(0, 0), (1241.9, 374.9), (-0.1, 100), (1242.1, 100), (100, -0.1), (100, 375.1)]
+    points = np.array([[10, (600 - u) / 70, (180 - v) / 70, 0] for u, v in pixels] + [[-10, 0, 0, 0], [0, 0, 0, 0]])
+    # the first lies on the edge itself: a hair inside, as rounding would have it either way
+    points[0, 1:3] -= 1e-9
+    assert in_image(points, PLAIN, SIZE).tolist() == [True, True] + [False] * 6
+
+
+def test_read_frame(root: Path) -> None:
+    frame = read_frame(root, "000000")
+    assert frame.points.tolist() == [[10, 0, 0, 0.5]]
+    assert frame.points.dtype == frame.boxes.dtype == torch.float32
+    assert frame.dropped == 1
+    assert frame.names == ("Car",)
+    assert frame.boxes.shape == (1, 7)
+    assert frame.labels.name.tolist() == ["Car", "DontCare"]
+    assert frame.image_size == SIZE
+    assert len(read_frame(root, "000000", crop=False).points) == 3
+
+
+def test_read_frame_without_labels(root: Path) -> None:
+    (root / "training" / "label_2" / "000000.txt").unlink()
+    frame = read_frame(root, "000000", labelled=False)
+    assert frame.boxes.shape == (0, 7)
+    assert frame.names == ()
+    assert len(frame.labels) == 0
+
+
+def test_image_size_comes_from_the_image(root: Path) -> None:
+    path = root / "training" / "image_2" / "000000.png"
+    Image.new("RGB", (1224, 370)).save(path)
+    assert read_frame(root, "000000").image_size == (1224, 370)
+    path.write_text("no image")
+    with pytest.raises(InputError, match=re.escape(f"{path}: not an image")):
+        read_frame(root, "000000")
+
+
+def test_read_split(root: Path) -> None:
+    assert read_split(root, "train") == ["000000", "000001"]
+    path = root / "ImageSets" / "val.txt"
+    with pytest.raises(InputError, match=re.escape(f"{path}: no such file; it holds the frames of split 'val'")):
+        read_split(root, "val")
+    path.write_text("\n\n")
+    with pytest.raises(InputError, match=re.escape(f"{path}: names no frame")):
+        read_split(root, "val")
+    path.write_text("000000\n\n000001\n000000\n")
+    with pytest.raises(InputError, match=re.escape(f"{path}:4: frame 000000 stands on line 1 already")):
+        read_split(root, "val")
+
+
+@pytest.mark.parametrize("file", ["velodyne/000001.bin", "calib/000001.txt", "label_2/000001.txt"])
+def test_split_names_a_missing_frame(root: Path, file: str) -> None:
+    missing = root / "training" / file
+    missing.unlink()
+    message = f"{root / 'ImageSets' / 'train.txt'}:2: frame 000001 has no {missing}; add the file or remove the line"
+    with pytest.raises(InputError, match=re.escape(message)):
+        read_split(root, "train")
+    if "label" in file:
+        assert read_split(root, "train", labelled=False) == ["000000", "000001"]
+
+
+def test_detections_to_labels() -> None:
+    boxes = torch.tensor([[20.0, 0, 0, 4, 2, 2, 0], [-20, 0, 0, 4, 2, 2, 0], [20, 20, 0, 4, 2, 2, math.pi / 4]])
+    scores = torch.tensor([0.5, 0.75, 0.25])
+    labels = detections_to_labels(boxes, scores, ["Car", "Van", "Cyclist"], PLAIN, (1400, 375))
+    assert labels.name.tolist() == ["Car"]
+    labels = detections_to_labels(boxes[[0, 2]].requires_grad_(), scores[[0, 2]], ["Car", "Cyclist"], PLAIN, SIZE)
+    assert labels.name.tolist() == ["Car"]
+    assert labels.score is not None
+    assert labels.score.tolist() == [0.5]
+    assert labels.truncation.tolist() == labels.occlusion.tolist() == [-1]
+    np.testing.assert_allclose(labels.location, [[0, 1, 20]], atol=1e-12)
+    np.testing.assert_allclose(labels.dimensions, [[2, 2, 4]])
+    np.testing.assert_allclose([labels.rotation_y[0], labels.alpha[0]], [-math.pi / 2] * 2)
+    assert len(detections_to_labels(boxes[:0], scores[:0], [], PLAIN, SIZE)) == 0
+
+
+def test_alpha_is_the_angle_from_the_line_of_sight() -> None:
+    """A car that drives along the line of sight has the alpha of one straight ahead that drives away."""
+    box = torch.tensor([[20.0, 10, 0, 4, 2, 2, math.atan2(10, 20)]])
+    labels = detections_to_labels(box, torch.ones(1), ["Car"], PLAIN, SIZE)
+    np.testing.assert_allclose(labels.alpha, [-math.pi / 2], atol=1e-6)
+
+
+def test_real_files_are_written_as_they_were_read(kitti_root: Path, tmp_path: Path) -> None:
+    for path in sorted((kitti_root / "training" / "label_2").iterdir()):
+        write_labels(tmp_path / "label.txt", read_labels(path))
+        assert (tmp_path / "label.txt").read_text() == path.read_text()
+    for path in sorted((kitti_root / "training" / "calib").iterdir()):
+        calib = read_calibration(path)
+        write_calibration(tmp_path / "calib.txt", calib)
+        lines = path.read_text().splitlines()
+        kept = [line for line in lines if line.split(":")[0] in ("P2", "R0_rect", "Tr_velo_to_cam")]
+        written = (tmp_path / "calib.txt").read_text().splitlines()
+        assert all(line in written for line in kept)
+
+
+def test_real_frame(kitti_root: Path) -> None:
+    frame = read_frame(kitti_root, "000008")
+    whole = read_frame(kitti_root, "000008", crop=False)
+    assert frame.names == ("Car",) * 6
+    assert 0.14 < len(frame.points) / len(whole.points) < 0.18
+    counts = points_in_boxes(frame.points, frame.boxes).sum(dim=0)
+    assert (counts >= 50).all()  # every labelled car was hit
+    # the cars stand on the ground, 1.73 m below the scanner, which looks along +x
+    assert ((frame.boxes[:, 2] - frame.boxes[:, 5] / 2).abs() - 1.73).abs().max() < 0.5
+    assert (frame.boxes[:, 0] > 0).all()
+
+
+def test_real_boxes_project_to_their_2d_labels(kitti_root: Path) -> None:
+    untruncated, truncated, alphas = [], [], []
+    for split in ("train", "val"):
+        for frame_id in read_split(kitti_root, split):
+            frame = read_frame(kitti_root, frame_id, crop=False)
+            cars = frame.labels.select(frame.labels.name == "Car")
+            found = detections_to_labels(
+                torch.from_numpy(boxes_to_lidar(cars, frame.calib)),
+                torch.ones(len(cars)),
+                cars.name.tolist(),
+                frame.calib,
+                frame.image_size,
+            )
+            assert len(found) == len(cars)  # what is labelled is in the image
+            np.testing.assert_allclose(found.location, cars.location, atol=1e-9)
+            np.testing.assert_allclose(found.rotation_y, cars.rotation_y, atol=1e-9)
+            alphas.append(np.abs(np.angle(np.exp(1j * (found.alpha - cars.alpha)))))
+            overlap = overlap_2d(found.bbox, cars.bbox)
+            untruncated.append(overlap[cars.truncation == 0])
+            truncated.append(overlap[cars.truncation > 0])
+    assert np.concatenate(untruncated).min() > 0.98
+    assert np.concatenate(truncated).min() > 0.89
+    assert np.concatenate(alphas).max() < 0.04

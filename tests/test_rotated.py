@@ -1,0 +1,393 @@
+"""Rotated IoU, NMS and matching against shapely in float64, hand-made cases and their twins."""
+
+import math
+
+import numpy as np
+import pytest
+import shapely
+import torch
+from torch import Tensor
+
+from hvnet.kernels import reference, rotated
+
+DTYPES = (torch.float32, torch.float64)
+# float64: the reference itself rounds corners at 1e4 m to 2e-12 m. float32: sine, cosine and corners about the centre
+# carry a few 6e-8 of the box's length, times its outline over its area (up to 10 here)
+TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
+
+
+def random_boxes(count: int, seed: int, spread: float = 4.0, scale: float = 1.0, centre: float = 0.0) -> Tensor:
+    """Boxes (count, 7) float64 of 1 to 5 scales' length and width, within +-spread scales of the centre."""
+    generator = np.random.default_rng(seed)
+    boxes = np.empty((count, 7))
+    boxes[:, :3] = generator.uniform(-spread, spread, (count, 3)) * scale
+    boxes[:, :2] += centre
+    boxes[:, 3:6] = generator.uniform(1, 5, (count, 3)) * scale
+    boxes[:, 6] = generator.uniform(-math.pi, math.pi, count)
+    return torch.from_numpy(boxes)
+
+
+def polygons(boxes: Tensor) -> np.ndarray:
+    """Shapely polygons (M,) of boxes (M, 7), of the very numbers given, in float64."""
+    x, y, _, length, width, _, yaw = boxes.double().numpy().T
+    along, across = np.array([1, -1, -1, 1]) / 2 * length[:, None], np.array([1, 1, -1, -1]) / 2 * width[:, None]
+    cos, sin = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    corners = np.stack((x[:, None] + along * cos - across * sin, y[:, None] + along * sin + across * cos), axis=-1)
+    return shapely.polygons(corners)
+
+
+def shapely_iou(a: Tensor, b: Tensor, heights: bool = False) -> Tensor:
+    """IoU (A, B) float64 in BEV, or in 3D."""
+    shared = torch.from_numpy(shapely.area(shapely.intersection(polygons(a)[:, None], polygons(b)[None])))
+    a, b = a.double()[:, None], b.double()[None]
+    size_a, size_b = a[..., 3] * a[..., 4], b[..., 3] * b[..., 4]
+    if heights:
+        top = torch.minimum(a[..., 2] + a[..., 5] / 2, b[..., 2] + b[..., 5] / 2)
+        bottom = torch.maximum(a[..., 2] - a[..., 5] / 2, b[..., 2] - b[..., 5] / 2)
+        shared, size_a, size_b = shared * (top - bottom).clamp(min=0), size_a * a[..., 5], size_b * b[..., 5]
+    return shared / (size_a + size_b - shared)
+
+
+def box(
+    x: float, y: float, length: float, width: float, yaw: float = 0.0, z: float = 0.0, height: float = 1.0
+) -> Tensor:
+    return torch.tensor([[x, y, z, length, width, height, yaw]], dtype=torch.float64)
+
+
+def equals(actual: Tensor, expected: Tensor, tolerance: float) -> None:
+    torch.testing.assert_close(actual.cpu().double(), expected.double(), rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(
+    ("scale", "centre"),
+    [(1, 0), (1e-3, 0), (1e3, 0), (1, 1e4), (1e-3, 1)],
+    ids=["near", "tiny", "huge", "far", "tiny off"],
+)
+def test_random_boxes(scale: float, centre: float, dtype: torch.dtype, device: torch.device) -> None:
+    """3,600 pairs. Far boxes are as exact as near ones: the difference of two near floats has no rounding."""
+    a, b = random_boxes(60, 1, 4, scale, centre).to(dtype), random_boxes(60, 2, 4, scale, centre).to(dtype)
+    bev, solid = rotated.rotated_iou_bev(a.to(device), b.to(device)), rotated.rotated_iou_3d(a.to(device), b.to(device))
+    assert bev.dtype == solid.dtype == dtype
+    for actual, heights in ((bev, False), (solid, True)):
+        expected = shapely_iou(a, b, heights)
+        assert (expected > 0).any()
+        assert (expected == 0).any()
+        assert actual.min() >= 0
+        assert actual.max() <= 1
+        equals(actual, expected, TOLERANCE[dtype])
+    equals(bev, reference.rotated_iou_bev(a.double(), b.double()), TOLERANCE[dtype])
+    equals(solid, reference.rotated_iou_3d(a.double(), b.double()), TOLERANCE[dtype])
+    equals(rotated.rotated_iou_bev(b.to(device), a.to(device)).T, bev.cpu(), TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("scale", [1e-3, 1, 1e3])
+def test_overlap_is_seen_exactly(scale: float, dtype: torch.dtype, device: torch.device) -> None:
+    """A thousandth of a scale apart is an IoU of 0, not a rounding: matching and NMS ask whether it is above 0."""
+    boxes = random_boxes(300, 14, 10, scale).to(dtype)
+    area = polygons(boxes)
+    apart = torch.from_numpy(shapely.distance(area[:, None], area[None]) > 1e-3 * scale)
+    shared = torch.from_numpy(shapely.area(shapely.intersection(area[:, None], area[None])) > 1e-6 * scale**2)
+    for iou in (rotated.rotated_iou_bev, rotated.rotated_iou_3d):
+        assert not iou(boxes.to(device), boxes.to(device)).cpu()[apart].any()
+    assert rotated.rotated_iou_bev(boxes.to(device), boxes.to(device)).cpu()[shared].all()
+    first, second = apart.nonzero().unbind(1)
+    assert not rotated.rotated_overlap_pairs(boxes[first].to(device), boxes[second].to(device)).any()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_overlap_of_pairs(dtype: torch.dtype, device: torch.device) -> None:
+    a, b = random_boxes(2000, 3).to(dtype), random_boxes(2000, 4).to(dtype)
+    areas = rotated.rotated_overlap_pairs(a.to(device), b.to(device))
+    assert areas.shape == (2000,)
+    expected = torch.from_numpy(shapely.area(shapely.intersection(polygons(a), polygons(b))))
+    equals(areas, expected, 25 * TOLERANCE[dtype])  # in square metres: up to 25
+    equals(areas, reference.rotated_overlap_pairs(a.double(), b.double()), 25 * TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("centre", [0, 37.3, 1e4])
+def test_identical_boxes(centre: float, dtype: torch.dtype, device: torch.device) -> None:
+    """Exactly 1 for equal numbers; a half-turn gives the same rectangle, a quarter-turn of a square too."""
+    boxes = random_boxes(200, 5, 50, centre=centre).to(device, dtype)
+    boxes[:4, 6] = torch.tensor([0, math.pi / 2, -math.pi, math.pi / 4])
+    one = torch.ones(200, dtype=torch.float64)
+    for iou in (rotated.rotated_iou_bev, rotated.rotated_iou_3d):
+        assert torch.equal(iou(boxes, boxes).diagonal().cpu().double(), one)
+    turned = boxes.clone()
+    turned[:, 6] += math.pi  # in float32 a yaw of up to 2 pi is off by 5e-7
+    equals(rotated.rotated_iou_bev(boxes, turned).diagonal(), one, TOLERANCE[dtype])
+    equals(rotated.rotated_iou_3d(boxes, turned).diagonal(), one, TOLERANCE[dtype])
+    square = boxes.clone()
+    square[:, 4] = square[:, 3]
+    turned = square.clone()
+    turned[:, 6] += math.pi / 2
+    equals(rotated.rotated_iou_bev(square, turned).diagonal(), one, TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("yaw", [0.0, 0.3, math.pi / 4, math.pi / 2, -2.0, math.pi])
+def test_hand_made_pairs(yaw: float, dtype: torch.dtype, device: torch.device) -> None:
+    """Known areas, with the whole scene turned by yaw about the origin."""
+    pairs = [
+        (box(0, 0, 4, 2), box(0, 0, 2, 1), 2.0),  # contained
+        (box(0, 0, 4, 2), box(1, 0.5, 2, 1), 2.0),  # contained, in a corner
+        (box(0, 0, 4, 2), box(4, 0, 4, 2), 0.0),  # touching edges
+        (box(0, 0, 4, 2), box(4, 2, 4, 2), 0.0),  # touching corners
+        (box(0, 0, 4, 2), box(1, 0, 4, 2), 6.0),  # two edges in line
+        (box(0, 0, 4, 2), box(0, 0, 2, 4), 4.0),  # a cross
+        (box(0, 0, 2, 2), box(0, 0, 2, 2, math.pi / 4), 8 * (math.sqrt(2) - 1)),  # an octagon
+        (box(0, 0, 2, 2), box(1, 1, 2, 2, math.pi / 4), 1.0),  # the centre of each on an edge or corner of the other
+        (box(0, 0, 2, 2), box(1 + math.sqrt(2), 0, 2, 2, math.pi / 4), 0.0),  # a corner touches an edge
+        (box(0, 0, 2, 2), box(3, 3, 2, 2, math.pi / 4), 0.0),  # apart, though their upright bounds meet
+        (box(0, 0, 100, 0.5), box(0, 0, 0.5, 100), 0.25),  # slender
+    ]
+    turn = torch.tensor([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]], dtype=torch.float64)
+    a, b = (torch.cat([pair[side] for pair in pairs]) for side in (0, 1))
+    area = torch.tensor([pair[2] for pair in pairs], dtype=torch.float64)
+    for boxes in (a, b):
+        boxes[:, :2] = boxes[:, :2] @ turn.T
+        boxes[:, 6] += yaw
+    a, b = a.to(device, dtype), b.to(device, dtype)
+    equals(rotated.rotated_overlap_pairs(a, b), area, 2 * TOLERANCE[dtype])
+    union = (a[:, 3] * a[:, 4] + b[:, 3] * b[:, 4]).cpu().double() - area
+    equals(rotated.rotated_iou_bev(a, b).diagonal(), area / union, TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_almost_equal_boxes(dtype: torch.dtype, device: torch.device) -> None:
+    """Edges that almost coincide are where clipping by point-in-box tests loses corners."""
+    generator = np.random.default_rng(6)
+    a = random_boxes(3000, 7)
+    noise = generator.normal(size=(3000, 7)) * 10.0 ** generator.uniform(-12, -2, (3000, 1))
+    b = a + torch.from_numpy(noise * (generator.random((3000, 7)) < 0.4))
+    b[::3, 6] += math.pi
+    a, b = a.to(dtype), b.to(dtype)
+    actual = rotated.rotated_overlap_pairs(a.to(device), b.to(device))
+    expected = reference.rotated_overlap_pairs(a.double(), b.double())
+    equals(actual, expected, 25 * TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_slender_boxes(dtype: torch.dtype, device: torch.device) -> None:
+    """100 m by 1 cm: a rounding of the yaw (3e-8) moves the ends by 1.5e-6 m of the 0.01 m."""
+    a, b = random_boxes(60, 8), random_boxes(60, 9)
+    for boxes in (a, b):
+        boxes[:, 3], boxes[:, 4] = 100, 0.01
+    b[:30, :2], b[:30, 6] = a[:30, :2], a[:30, 6]
+    b[10:20, 1] += 0.003
+    b[20:30, 6] += 1e-4
+    a, b = a.to(dtype), b.to(dtype)
+    actual = rotated.rotated_iou_bev(a.to(device), b.to(device))
+    equals(actual, shapely_iou(a, b), 200 * TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_boxes_without_area(dtype: torch.dtype, device: torch.device) -> None:
+    flat = torch.cat((box(0, 0, 0, 0), box(0, 0, 4, 0), box(0, 0, 0, 2, 0.7), box(0, 0, 4, 2, height=0.0)))
+    flat, whole = flat.to(device, dtype), box(0, 0, 4, 2).to(device, dtype)
+    for other in (flat, whole):
+        assert not rotated.rotated_iou_bev(flat[:3], other).any()
+        assert not rotated.rotated_iou_3d(flat, other).any()
+        assert not rotated.rotated_iou_bev(other, flat[:3]).any()
+        assert not rotated.rotated_iou_3d(other, flat).any()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_heights(dtype: torch.dtype, device: torch.device) -> None:
+    """z is the box's centre."""
+    a = box(0, 0, 4, 2, z=-1.0, height=2.0)
+    b = torch.cat([box(0, 0, 4, 2, z=z, height=h) for z, h in ((-1, 2), (0, 2), (1, 2), (1.5, 2), (-1, 1), (9, 1))])
+    iou = rotated.rotated_iou_3d(a.to(device, dtype), b.to(device, dtype))
+    equals(iou, torch.tensor([[1, 1 / 3, 0, 0, 0.5, 0]]), 1e-7)
+
+
+def test_no_boxes(device: torch.device) -> None:
+    none, some = torch.zeros(0, 7, device=device), random_boxes(3, 10).float().to(device)
+    for iou in (rotated.rotated_iou_bev, rotated.rotated_iou_3d):
+        assert iou(none, some).shape == (0, 3)
+        assert iou(some, none).shape == (3, 0)
+        assert iou(none, none).shape == (0, 0)
+    assert rotated.rotated_overlap_pairs(none, none).shape == (0,)
+    kept = rotated.rotated_nms(none, torch.zeros(0, device=device), 0.5)
+    assert kept.shape == (0,)
+    assert kept.dtype == torch.int64
+
+
+def test_layout_does_not_matter(device: torch.device) -> None:
+    a, b = random_boxes(20, 11).float().to(device), random_boxes(20, 12).float().to(device)
+    scores = torch.rand(20, generator=torch.Generator().manual_seed(0)).to(device)
+    wide = torch.full((20, 14), 9.0, device=device)
+    wide[:, ::2] = a
+    for view in (wide[:, ::2], a.t().contiguous().t()):
+        assert torch.equal(rotated.rotated_iou_bev(view, b), rotated.rotated_iou_bev(a, b))
+        assert torch.equal(rotated.rotated_iou_3d(b, view), rotated.rotated_iou_3d(b, a))
+        assert torch.equal(rotated.rotated_overlap_pairs(view, b), rotated.rotated_overlap_pairs(a, b))
+        two = torch.stack((scores, scores), dim=1)[:, 0]
+        assert torch.equal(rotated.rotated_nms(view, two, 0.2), rotated.rotated_nms(a, scores, 0.2))
+        starts = torch.tensor([0, 9, 5, 9, 20, 9], device=device)[::2]
+        for first, second in zip(
+            rotated.rotated_match(view, b, starts), rotated.rotated_match(a, b, starts.clone()), strict=True
+        ):
+            assert torch.equal(first, second)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("threshold", [0.0, 0.1, 0.5])
+@pytest.mark.parametrize("count", [1, 2, 63, 64, 65, 129, 400])
+def test_nms_equals_twin(count: int, threshold: float, dtype: torch.dtype, device: torch.device) -> None:
+    boxes = random_boxes(count, 14, spread=10).to(dtype)
+    scores = torch.rand(count, generator=torch.Generator().manual_seed(count)).to(dtype)
+    if threshold:  # no pair so near to the threshold that rounding decides
+        assert not ((reference.rotated_iou_bev(boxes.double(), boxes.double()) - threshold).abs() < 1e-5).any()
+    kept = rotated.rotated_nms(boxes.to(device), scores.to(device), threshold)
+    assert kept.dtype == torch.int64
+    assert kept.tolist() == reference.rotated_nms(boxes, scores, threshold).tolist()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_nms_by_hand(dtype: torch.dtype, device: torch.device) -> None:
+    def kept(boxes: list[Tensor], scores: list[float], threshold: float) -> list[int]:
+        given = torch.cat(boxes).to(device, dtype), torch.tensor(scores, dtype=dtype, device=device)
+        return rotated.rotated_nms(*given, threshold).tolist()
+
+    chain = [box(1.5 * k, 0, 4, 2) for k in range(5)]  # neighbours 5/11, next but one 1/7
+    assert kept(chain, [5, 4, 3, 2, 1], 0.3) == [0, 2, 4]  # what 1 would drop is kept: 0 has dropped 1
+    assert kept(chain, [1, 5, 2, 4, 3], 0.3) == [1, 3]
+    assert kept(chain, [5, 4, 3, 2, 1], 0.1) == [0, 3]
+    same = [box(0, 0, 4, 2, 0.3)] * 4
+    assert kept(same, [0.5] * 4, 0.5) == [0]  # equal scores: the lower index
+    assert kept(same, [-0.0, 0.0, -0.0, 0.0], 0.5) == [0]  # zeros are equal
+    assert kept(same, [0.5, 0.7, 0.7, 0.1], 0.5) == [1]
+    assert kept(same, [0.1, 0.2, 0.3, 0.4], 1.0) == [3, 2, 1, 0]  # an IoU of 1 is not above 1
+    apart = [box(10.0 * k, 0, 4, 2) for k in range(6)]
+    assert kept(apart, [1, 2, 2, 0, 2, 1], 0.5) == [1, 2, 4, 0, 5, 3]
+    assert kept(apart, [0, math.inf, -math.inf, -5, 5, 0], 0.5) == [1, 4, 0, 5, 3, 2]
+    touching = [box(0, 0, 4, 2), box(4, 0, 4, 2)]
+    assert kept(touching, [1, 2], 0.0) == [1, 0]
+    half = [box(0, 0, 2, 2), box(0, 0, 2, 1)]
+    assert kept(half, [1, 2], 0.5) == [1, 0]  # dropped above the threshold, not at it
+    assert kept(half, [1, 2], 0.49) == [1]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_match_by_hand(dtype: torch.dtype, device: torch.device) -> None:
+    anchors = torch.cat([box(0, 0, 4, 2), box(2, 0, 4, 2), box(2, 0, 4, 2), box(50, 0, 4, 2)])
+    boxes = torch.cat(
+        [
+            box(1, 0, 4, 2),  # sample 0: 3/5 with anchors 0, 1 and 2, a tie
+            box(1, 0, 4, 2),  # the same again: a tie for the anchors
+            box(-90, 0, 4, 2),  # overlaps nothing
+            box(2, 0, 2, 4),  # sample 2: 1/3 with anchors 1 and 2, 1/7 with 0
+            box(3, 0, 4, 2),  # 3/5 with anchors 1 and 2, 1/7 with 0: a tie for anchor 0
+        ]
+    )
+    starts = torch.tensor([0, 3, 3, 5])
+    iou, match, best = rotated.rotated_match(anchors.to(device, dtype), boxes.to(device, dtype), starts.to(device))
+    expected = torch.tensor([[3 / 5, 3 / 5, 3 / 5, 0], [0, 0, 0, 0], [1 / 7, 3 / 5, 3 / 5, 0]])
+    equals(iou, expected, 1e-7)
+    assert iou.dtype == dtype
+    assert match.tolist() == [[0, 0, 0, -1], [-1] * 4, [3, 4, 4, -1]]
+    assert best.tolist() == [0, 0, -1, 1, 1]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_match_equals_matrix(dtype: torch.dtype, device: torch.device) -> None:
+    anchors, boxes = random_boxes(700, 14, 30).to(dtype), random_boxes(40, 15, 30).to(dtype)
+    starts = torch.tensor([0, 15, 15, 33, 40])
+    anchors[350:] = anchors[:350]  # every anchor twice: the first wins
+    actual = rotated.rotated_match(anchors.to(device), boxes.to(device), starts.to(device))
+    expected = reference.rotated_match(anchors.double(), boxes.double(), starts)
+    equals(actual[0], expected[0], TOLERANCE[dtype])
+    assert (expected[0] > 0.3).any()
+    assert torch.equal(actual[1].cpu(), expected[1])
+    assert torch.equal(actual[2].cpu(), expected[2])
+    assert actual[2].max() < 350
+
+
+def test_match_agrees_with_iou(device: torch.device) -> None:
+    """The same arithmetic as the matrix, for more anchors than one block or one launch holds."""
+    anchors, boxes = random_boxes(70_001, 16, 60).float().to(device), random_boxes(6, 17, 60).float().to(device)
+    iou, match, best = rotated.rotated_match(anchors, boxes, torch.tensor([0, 6], device=device))
+    matrix = rotated.rotated_iou_bev(anchors, boxes)
+    assert torch.equal(iou[0], matrix.amax(1))
+    assert torch.equal(match[0], matrix.argmax(1).where(matrix.amax(1) > 0, -1))
+    assert torch.equal(best, matrix.argmax(0))
+
+
+def test_match_without_boxes_or_anchors(device: torch.device) -> None:
+    some, none = random_boxes(3, 18).float().to(device), torch.zeros(0, 7, device=device)
+    iou, match, best = rotated.rotated_match(some, none, torch.tensor([0, 0, 0], device=device))
+    assert iou.tolist() == [[0] * 3] * 2
+    assert match.tolist() == [[-1] * 3] * 2
+    assert best.shape == (0,)
+    iou, match, best = rotated.rotated_match(none, some, torch.tensor([0, 3], device=device))
+    assert iou.shape == match.shape == (1, 0)
+    assert best.tolist() == [-1] * 3
+
+
+def test_same_bits_on_every_run(device: torch.device) -> None:
+    boxes = random_boxes(300, 19, spread=10).float().to(device)
+    scores = torch.rand(300, generator=torch.Generator().manual_seed(0)).to(device)
+    starts = torch.tensor([0, 100, 300], device=device)
+
+    def results() -> list[Tensor]:
+        ious = [rotated.rotated_iou_bev(boxes, boxes), rotated.rotated_iou_3d(boxes, boxes)]
+        return [*ious, rotated.rotated_nms(boxes, scores, 0.1), *rotated.rotated_match(boxes, boxes, starts)]
+
+    for first, second in zip(results(), results(), strict=True):
+        assert torch.equal(first, second)
+
+
+@pytest.mark.parametrize("name", ["rotated_iou_bev", "rotated_iou_3d", "rotated_overlap_pairs"])
+def test_bad_pairs(name: str) -> None:
+    function, good = getattr(rotated, name), torch.ones(2, 7)
+    bad = [
+        (TypeError, [[1.0] * 7]),
+        (TypeError, torch.ones(2, 7, dtype=torch.int64)),
+        (TypeError, torch.ones(2, 7, dtype=torch.float16)),
+        (ValueError, torch.ones(7)),
+        (ValueError, torch.ones(2, 6)),
+        (ValueError, torch.ones(2, 7, device="meta")),
+    ]
+    for error, value in bad:
+        with pytest.raises(error, match=r"\bb\b"):
+            function(good, value)
+        if not (isinstance(value, Tensor) and value.is_meta):  # of two devices, the second is the odd one
+            with pytest.raises(error, match=r"\ba\b"):
+                function(value, good)
+    with pytest.raises((TypeError, ValueError), match=r"\bb\b.*float64"):
+        function(good, torch.ones(2, 7, dtype=torch.float64))
+
+
+def test_pairs_of_different_length() -> None:
+    with pytest.raises(ValueError, match=r"\bb\b.*3"):
+        rotated.rotated_overlap_pairs(torch.ones(2, 7), torch.ones(3, 7))
+
+
+def test_bad_nms() -> None:
+    boxes, scores = torch.ones(3, 7), torch.ones(3)
+    with pytest.raises(ValueError, match=r"boxes.*8"):
+        rotated.rotated_nms(torch.ones(3, 8), scores, 0.5)
+    with pytest.raises(TypeError, match="boxes"):
+        rotated.rotated_nms(boxes.long(), scores, 0.5)
+    with pytest.raises(ValueError, match=r"scores.*2"):
+        rotated.rotated_nms(boxes, torch.ones(2), 0.5)
+    with pytest.raises(ValueError, match="scores"):
+        rotated.rotated_nms(boxes, torch.ones(3, 1), 0.5)
+    with pytest.raises(TypeError, match="scores"):
+        rotated.rotated_nms(boxes, scores.long(), 0.5)
+
+
+def test_bad_match() -> None:
+    anchors, boxes, starts = torch.ones(3, 7), torch.ones(2, 7), torch.tensor([0, 1, 2])
+    with pytest.raises(ValueError, match="anchors"):
+        rotated.rotated_match(torch.ones(3, 6), boxes, starts)
+    with pytest.raises(ValueError, match="boxes"):
+        rotated.rotated_match(anchors, torch.ones(7), starts)
+    with pytest.raises(TypeError, match=r"starts.*int32"):
+        rotated.rotated_match(anchors, boxes, starts.int())
+    for wrong in ([0, 1], [1, 2], [0, 2, 1, 2], [0, 3], []):
+        with pytest.raises(ValueError, match="starts"):
+            rotated.rotated_match(anchors, boxes, torch.tensor(wrong, dtype=torch.int64))
