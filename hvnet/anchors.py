@@ -77,7 +77,7 @@ def decode(corners: Tensor, vertical: Tensor, direction: Tensor | None, anchors:
     axis = left + right
     yaw = torch.atan2(axis[:, 1], axis[:, 0])
     if direction is not None:
-        yaw = yaw + math.pi * direction
+        yaw = yaw + math.pi * direction.to(yaw.dtype)
     height = anchors[:, 5]
     return torch.stack(
         (

@@ -19,7 +19,7 @@ from hvnet.config import Config, TrainConfig, config_to_dict, load_config
 from hvnet.data.augment import augment
 from hvnet.data.database import FILE_NAME, Database, build_database, read_database, write_database
 from hvnet.data.kitti import Frame, detections_to_labels, read_frame, read_split
-from hvnet.data.synthetic import generate
+from hvnet.data.synthetic import Options, generate
 from hvnet.draw import draw_bev
 from hvnet.evaluate import evaluate, format_table
 from hvnet.model import HVNet, load_checkpoint, save_checkpoint, select_device
@@ -318,9 +318,9 @@ def main(arguments: Sequence[str] | None) -> None:
     if root is None:
         if config.synthetic is None:
             raise InputError(f"{options.config}: has no key synthetic, so it needs --data with a KITTI root")
-        scenes = config.synthetic
-        root = out.parent / f"scenes-{scenes.train_frames}-{scenes.val_frames}-{config.train.seed}"
-        generate(root, scenes.train_frames, scenes.val_frames, config.train.seed)
+        scenes, reach = config.synthetic, config.encoder.point_range[3]
+        root = out.parent / f"scenes-{scenes.train_frames}-{scenes.val_frames}-{reach:g}m-{config.train.seed}"
+        generate(root, scenes.train_frames, scenes.val_frames, config.train.seed, Options(distance=(4.0, reach - 2)))
     out.mkdir(parents=True, exist_ok=True)
     train(config, root, out, device, options.resume)
 

@@ -304,7 +304,7 @@ def cyclist(length: float, width: float, height: float, rng: np.random.Generator
 
 def tree(rng: np.random.Generator) -> Mesh:
     """A trunk and a crown of leaves; crowns start low enough for the upper beams to meet them."""
-    trunk = rng.uniform(1.8, 3.2)
+    trunk = rng.uniform(1.2, 2.8)
     radius = rng.uniform(0.08, 0.25)
     width, tall = rng.uniform(2.5, 5.0), rng.uniform(2.5, 5.0)
     stem = tube((0, 0, -0.3), (0, 0, trunk + 0.4 * tall), radius, 0.5 * radius, Material.BARK)
@@ -327,7 +327,7 @@ def bush(width: float, height: float, rng: np.random.Generator) -> Mesh:
 def hedge(length: float, depth: float, height: float, rng: np.random.Generator) -> Mesh:
     """A clipped hedge along x."""
     core = block((length, 0.7 * depth, 0.9 * height + 0.3), (0, 0, 0.45 * height - 0.15), Material.LEAF)
-    return join(core, leaves((length, depth, height), (0, 0, height / 2), int(22 * length), 0.2, rng, round_=False))
+    return join(core, leaves((length, depth, height), (0, 0, height / 2), int(30 * length), 0.3, rng, round_=False))
 
 
 def fence(length: float, height: float) -> Mesh:

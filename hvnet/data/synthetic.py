@@ -5,7 +5,6 @@ sensor at 0) and turned to LiDAR axes: x forward, y left, z up, metres, the sens
 """
 
 import argparse
-import functools
 import json
 import math
 import os
@@ -63,6 +62,8 @@ OCCLUSION = (0.15, 0.5, 0.85)
 
 # Elevations of the 64 beams in degrees (Velodyne HDL-64E manual): the upper block is spaced 1/3, the lower 1/2 degree
 BEAMS = np.concatenate((2 - np.arange(32) / 3, 2 - 31 / 3 - 0.5 * np.arange(1, 33)))
+BEAM_SHIFTS = np.random.default_rng(64).random(64)
+"""Steps of azimuth (64,) by which the beams are out of line: the same in every turn, as in one real sensor."""
 AZIMUTH_STEP = 0.1728  # degrees, at 10 turns a second
 RANGE_NOISE = 0.02  # metres, standard deviation
 THRESHOLD = 4.5e-5
@@ -227,14 +228,14 @@ def _ground(rng: np.random.Generator, road: Road) -> tuple[Ground, Mesh]:
     step = 0.03  # metres over which a kerb rises
     right, left = road.edges
     outer_right, outer_left = road.walks()
-    v = np.concatenate(
+    v = np.concatenate(  # finer where there is more to see
         (
             [-120, -80, -50, -35, -25, -18, outer_right - 4, outer_right, right - step],
             np.linspace(right, left, 7),
             [left + step, outer_left, outer_left + 4, 20, 27, 37, 52, 80, 120],
         )
     )
-    v = np.unique(v)  # the plots' lines may fall among the outer ones
+    v = np.unique(v)  # sorted: a wide street's sidewalk may lie beyond the first outer lines
     u = np.arange(road.reach[0], road.reach[1] + 3, 3.0)
     if math.isfinite(road.crossing):
         low, high = road.crossing - road.crossing_width / 2, road.crossing + road.crossing_width / 2
@@ -250,7 +251,7 @@ def _ground(rng: np.random.Generator, road: Road) -> tuple[Ground, Mesh]:
     ground = replace(ground, z=z - ground.height(0, 0) - SENSOR_HEIGHT)
 
     mid_u, mid_v = (u[1:] + u[:-1])[:, None] / 2, (v[1:] + v[:-1]) / 2
-    paved = (mid_v > outer_right) & (mid_v < outer_left) & (mid_u > -math.inf)
+    paved = (mid_v > outer_right) & (mid_v < outer_left)
     driven = ((mid_v > right) & (mid_v < left)) | (np.abs(mid_u - road.crossing) < road.crossing_width / 2)
     material = np.where(driven, Material.ASPHALT, np.where(paved, Material.PAVING, Material.GRASS))
     pose = np.stack(np.broadcast_arrays(u[:, None], v, 0.0), axis=-1)
@@ -294,7 +295,7 @@ def _plots(rng: np.random.Generator, road: Road) -> tuple[list[Thing], Floats]:
 
 def _plot(rng: np.random.Generator, length: float) -> tuple[list[Thing], list[tuple[float, float]]]:
     """What stands on one plot, and the x and yaw of the cars if it is a parking lot; y = 0 is the sidewalk's edge."""
-    kind = rng.choice(["house", "garden", "open", "lot"], p=[0.35, 0.35, 0.18, 0.12])
+    kind = rng.choice(["house", "garden", "open", "lot"], p=[0.29, 0.33, 0.27, 0.11])
     things = []
     if kind != "open":
         setback = rng.uniform(*{"house": (0, 0.6), "garden": (4, 8), "lot": (8, 14)}[kind])
@@ -314,7 +315,7 @@ def _plot(rng: np.random.Generator, length: float) -> tuple[list[Thing], list[tu
         elif front == 2:
             things.append(Thing(shapes.fence(span, rng.uniform(0.9, 1.6)), (0, 0.2, 0), (span, 0.2)))
     if kind != "house":
-        for _ in range(rng.integers(1, 4)):
+        for _ in range(rng.integers(2, 7)):
             pose = (rng.uniform(1 - length / 2, length / 2 - 1), rng.uniform(1.5, 3.5 if kind == "garden" else 12), 0)
             if rng.random() < 0.5:
                 things.append(Thing(shapes.tree(rng), pose, (0.6, 0.6)))
@@ -376,10 +377,10 @@ def _car_poses(rng: np.random.Generator, road: Road, slots: Floats, options: Opt
     poses[elsewhere, 1] = rng.uniform(road.edges[0] + 1, road.edges[1] - 1, elsewhere.sum())
     poses[elsewhere, 2] = rng.uniform(-math.pi, math.pi, elsewhere.sum())
     if math.isfinite(road.crossing):
-        rows = np.flatnonzero((spot < 0.15) | (elsewhere & (spot < 0.8)))
+        rows = np.flatnonzero((spot < 0.08) | (elsewhere & (spot < 0.8)))
         way = rng.choice([-1, 1], len(rows))  # to the right, to the left
         poses[rows, 0] = road.crossing + way * road.crossing_width / 4
-        poses[rows, 1] = rng.uniform(-30, 30, len(rows))
+        poses[rows, 1] = rng.uniform(-20, 20, len(rows))
         poses[rows, 2] = way * math.pi / 2
     if len(slots):
         rows = np.flatnonzero((spot > 0.75) | (elsewhere & (spot > 0.3)))
@@ -476,9 +477,10 @@ def build_scene(rng: np.random.Generator, options: Options) -> Scene:
             seen = np.abs(np.arctan2(poses[:, 1], poses[:, 0])) < math.radians(min(options.azimuth, 46))
             seen |= options.azimuth > 90
             seen &= (distance >= options.distance[0]) & (distance <= options.distance[1])
-            rows = np.flatnonzero(seen & _free(poses, size[:2], taken, gap))
-            if len(rows):
-                objects.append(_object(rng, name, size, poses[rows[0]], ground))
+            poses = poses[seen]
+            poses = poses[_free(poses, size[:2], taken, gap)]
+            if len(poses):
+                objects.append(_object(rng, name, size, poses[0], ground))
                 taken.append(objects[-1].box)
 
     count = round(share * rng.integers(24, 40))
@@ -549,18 +551,10 @@ def assemble(background: Sequence[tuple[Mesh, float]], objects: Sequence[Object]
 # --- the sensor ------------------------------------------------------------------------------------------------------
 
 
-@functools.cache
-def _beam_shifts() -> Floats:
-    """Azimuth (64,) in degrees by which the lasers of the sensor are out of line: fixed, as in one real sensor."""
-    return np.random.default_rng(64).uniform(-2, 2, len(BEAMS))
-
-
 def _directions(rng: np.random.Generator, azimuth: float) -> Floats:
     """Directions (R, 3) of all rays of one turn within the azimuth, beam by beam from the top."""
     steps = int(2 * azimuth / AZIMUTH_STEP)
-    turn = np.radians(-azimuth + AZIMUTH_STEP * (np.arange(steps) + rng.random()) + 0 * BEAMS[:, None])
-    # a shift that is a fraction of the step shears the columns without leaving the azimuth
-    turn += np.radians(np.mod(_beam_shifts(), AZIMUTH_STEP))[:, None]
+    turn = np.radians(-azimuth + AZIMUTH_STEP * (np.arange(steps) + rng.random() + BEAM_SHIFTS[:, None]))
     up = np.broadcast_to(np.radians(BEAMS)[:, None], turn.shape)
     return np.stack((np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)), axis=-1).reshape(-1, 3)
 

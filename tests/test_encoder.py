@@ -1,0 +1,179 @@
+"""The encoder against the paper's equations, written out plainly in float64 with the twins."""
+
+import dataclasses
+
+import pytest
+import torch
+from torch import Tensor
+
+from hvnet.config import EncoderConfig
+from hvnet.encoder import AttentiveVFE, HybridVoxelEncoder, projection_grids
+from hvnet.kernels import reference
+from hvnet.kernels.voxel import Grid
+
+# not square, so that a transpose of x and y would be seen
+SMALL = EncoderConfig(
+    point_range=(0.0, -3.2, -3.0, 12.8, 3.2, 2.0), voxel_size=(0.4, 0.4), feature_channels=8, image_channels=12
+)
+
+
+def cloud(count: int, seed: int = 0, samples: int = 2) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    low, high = torch.tensor([-1.0, -4.0, -3.5, 0.0]), torch.tensor([14.0, 4.0, 2.5, 1.0])
+    points = low + torch.rand(count, 4, generator=generator) * (high - low)
+    return points, torch.randint(samples, (count,), generator=generator).sort().values
+
+
+def plain_norm(norm: torch.nn.BatchNorm1d, rows: Tensor, training: bool) -> Tensor:
+    mean, var = (
+        (rows.mean(0), rows.var(0, unbiased=False))
+        if training
+        else (norm.running_mean.double(), norm.running_var.double())
+    )
+    return (rows - mean) / (var + norm.eps).sqrt() * norm.weight.double() + norm.bias.double()
+
+
+def plain_vfe(layer: AttentiveVFE, features: Tensor, knowledge: list[Tensor], training: bool) -> list[Tensor]:
+    weighed = plain_norm(layer.features_norm, features @ layer.features.weight.double().T, training)
+    attention = plain_norm(layer.knowledge_norm, torch.cat(knowledge) @ layer.knowledge.weight.double().T, training)
+    if layer.relu:
+        weighed, attention = weighed.relu(), attention.relu()
+    return [weighed * rows for rows in attention.chunk(len(knowledge))]
+
+
+def plain_encoder(
+    encoder: HybridVoxelEncoder, points: Tensor, sample: Tensor, batch_size: int, training: bool
+) -> list[Tensor]:
+    """Eq. 1 to 3 with dense scatter over the whole grid, one scale after the other."""
+    grids = encoder.feature_grids + encoder.projection_grids
+    cursors = [reference.cursors(points, sample, grid) for grid in grids]
+    kept = torch.stack([cursor >= 0 for cursor in cursors]).all(0)
+    cells = [batch_size * grid.shape[0] * grid.shape[1] for grid in grids]
+    p = points[kept].double()
+    cursors = [cursor[kept] for cursor in cursors]
+    knowledge = []
+    for cursor, size in zip(cursors, cells, strict=True):
+        mean = reference.scatter_mean(p, cursor, size)[cursor]
+        knowledge.append(torch.cat((p[:, :3] - mean[:, :3], p[:, 3:], mean), dim=1))
+    split = len(encoder.feature_grids)
+    parts = []
+    for product, cursor, size in zip(
+        plain_vfe(encoder.avfe, p, knowledge[:split], training), cursors, cells, strict=False
+    ):
+        parts += [product, reference.scatter_max(product, cursor, size)[0][cursor]]
+    products = plain_vfe(encoder.avfeo, torch.cat(parts, dim=1), knowledge[split:], training)
+    images = []
+    for product, cursor, size, grid in zip(products, cursors[split:], cells[split:], grids[split:], strict=True):
+        n_l, n_w = grid.shape
+        image = torch.zeros(batch_size, product.shape[1], n_l, n_w, dtype=torch.float64)
+        values, argmax = reference.scatter_max(product, cursor, size)
+        for cell in (argmax[:, 0] < len(product)).nonzero().squeeze(1).tolist():
+            image[cell // (n_l * n_w), :, (cell // n_w) % n_l, cell % n_w] = values[cell]  # Eq. 3
+        images.append(image)
+    return images
+
+
+SCALES = [
+    ((0.5, 1.0, 2.0), (1.0, 2.0, 4.0)),
+    ((1.0,), (1.0,)),
+    ((0.5, 1.0), (2.0,)),
+    ((0.25, 0.5, 1.0, 2.0, 4.0), (0.5, 1.0, 2.0, 4.0, 8.0)),
+    ((1.0, 1.5), (1.5, 3.0)),  # do not nest, and 0.6 m divides neither 12.8 nor 6.4 m
+]
+
+
+@pytest.mark.parametrize(("feature_scales", "projection_scales"), SCALES)
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize("relu", [True, False])
+def test_encoder_is_the_papers(
+    feature_scales: tuple[float, ...], projection_scales: tuple[float, ...], training: bool, relu: bool
+) -> None:
+    torch.manual_seed(1)
+    config = dataclasses.replace(
+        SMALL, feature_scales=feature_scales, projection_scales=projection_scales, attention_relu=relu
+    )
+    encoder = HybridVoxelEncoder(config)
+    for module in encoder.modules():  # running statistics and weights that are not those of the start
+        if isinstance(module, torch.nn.BatchNorm1d):
+            module.running_mean.normal_()
+            module.running_var.uniform_(0.5, 2)
+            torch.nn.init.normal_(module.weight)
+            torch.nn.init.normal_(module.bias)
+    encoder.train(training)
+    points, sample = cloud(400)
+    expected = plain_encoder(encoder, points, sample, 2, training)
+    images = encoder(points, sample, 2)
+    weights = [torch.randn_like(image) for image in images]
+    parameters = list(encoder.parameters())
+    got = torch.autograd.grad(sum((i * w).sum() for i, w in zip(images, weights, strict=True)), parameters)
+    want = torch.autograd.grad(sum((i * w.double()).sum() for i, w in zip(expected, weights, strict=True)), parameters)
+    for image, plain, grid in zip(images, expected, encoder.projection_grids, strict=True):
+        assert image.shape == (2, 12, *grid.shape)
+        assert image.is_contiguous(memory_format=torch.channels_last)
+        # sums of 400 rows and products of two normed values in float32
+        torch.testing.assert_close(image.double(), plain, rtol=1e-4, atol=1e-4)
+    for a, b in zip(got, want, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=2e-3 * float(b.abs().max()) + 1e-6)
+
+
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_points(count: int, training: bool) -> None:
+    encoder = HybridVoxelEncoder(SMALL).train(training)
+    points = torch.tensor([[5.0, 1.0, -1.0, 0.5], [5.0, 1.0, -1.0, 0.5]])[:count]
+    images = encoder(points, torch.zeros(count, dtype=torch.int64), 2)
+    assert [image.shape for image in images] == [(2, 12, 32, 16), (2, 12, 16, 8), (2, 12, 8, 4)]
+    assert all(image.isfinite().all() for image in images)
+    assert all((image.abs().sum(1) > 0).sum() <= min(count, 1) for image in images)
+    sum(image.sum() for image in images).backward()
+
+
+def test_a_million_points_in_one_voxel() -> None:
+    encoder = HybridVoxelEncoder(SMALL).eval()
+    points = torch.tensor([5.0, 1.0, -1.0, 0.5]).repeat(1_000_000, 1)
+    sample = torch.zeros(len(points), dtype=torch.int64)
+    with torch.no_grad():
+        many, one = encoder(points, sample, 1), encoder(points[:1], sample[:1], 1)
+    for a, b in zip(many, one, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
+
+
+def test_samples_do_not_mix() -> None:
+    encoder = HybridVoxelEncoder(SMALL).eval()
+    points, sample = cloud(300, samples=3)
+    with torch.no_grad():
+        together = encoder(points, sample, 3)
+        for b in range(3):
+            own = points[sample == b]
+            alone = encoder(own, torch.zeros(len(own), dtype=torch.int64), 1)
+            for a, t in zip(alone, together, strict=True):
+                torch.testing.assert_close(a[0], t[b], rtol=1e-5, atol=1e-5)
+
+
+def test_order_of_points_does_not_matter() -> None:
+    encoder = HybridVoxelEncoder(SMALL).eval()
+    points, sample = cloud(300)
+    shuffle = torch.randperm(300, generator=torch.Generator().manual_seed(3))
+    with torch.no_grad():
+        for a, b in zip(encoder(points, sample, 2), encoder(points[shuffle], sample[shuffle], 2), strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)
+
+
+def test_same_bits_twice() -> None:
+    points, sample = cloud(500)
+    results = []
+    for _ in range(2):
+        torch.manual_seed(0)
+        encoder = HybridVoxelEncoder(SMALL)
+        images = encoder(points, sample, 2)
+        sum(image.square().sum() for image in images).backward()
+        results.append(images + [p.grad for p in encoder.parameters()])
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_projection_grids_are_padded_and_halved() -> None:
+    config = EncoderConfig(projection_scales=(1.5, 3.0, 6.0))  # 0.3 m: 213.33 cells
+    grids = projection_grids(config)
+    assert [grid.cells for grid in grids] == [(214, 214), (107, 107), (54, 54)]
+    assert [grid.shape for grid in grids] == [(216, 216), (108, 108), (54, 54)]
+    assert isinstance(grids[0], Grid)
