@@ -190,7 +190,7 @@ def _build(kind: Any, value: Any, key: str, source: str) -> Any:
     def wrong(wanted: str) -> InputError:
         return InputError(f"{source}: {key}: want {wanted}, got {value!r} ({type(value).__name__})")
 
-    if dataclasses.is_dataclass(kind):
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
         if not isinstance(value, dict):
             raise wrong(f"a mapping with the keys {', '.join(_keys(kind))}")
         unknown = [str(name) for name in value if name not in _keys(kind)]

@@ -36,7 +36,7 @@ def projection_grids(config: EncoderConfig) -> list[Grid]:
 
 def attention_knowledge(points: Tensor, voxels: Voxels) -> Tensor:
     """Eq. 2: g = (x - mean x, f, mean p) of every point (N, d) in its voxel: (N, 2d)."""
-    mean = segment_mean(points, voxels.segments)[voxels.index]
+    mean = segment_mean(points, voxels.segments)[voxels.segments.voxel]
     return torch.cat((points[:, :3] - mean[:, :3], points[:, 3:], mean), dim=1)
 
 

@@ -20,6 +20,11 @@ class HeadMaps(NamedTuple):
     vertical: Tensor  # (B, A, 2)
     direction: Tensor | None  # (B, A, 2) logits
 
+    def of_sample(self, b: int) -> "HeadMaps":
+        """The maps of one sample, without the first dimension."""
+        direction = None if self.direction is None else self.direction[b]
+        return HeadMaps(self.logits[b], self.corners[b], self.vertical[b], direction)
+
 
 class Head(nn.Module):
     """Branches phi_c, phi_l, phi_h of one class, and the optional two-bin direction branch."""

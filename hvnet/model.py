@@ -38,7 +38,7 @@ class HVNet(nn.Module):
         self.heads = nn.ModuleList(Head(entry, channels, config.head.direction) for entry in config.head.classes)
         for k, entry in enumerate(config.head.classes):
             self.register_buffer(f"anchors_{k}", make_anchors(config, entry), persistent=False)
-        self.to(memory_format=torch.channels_last)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def anchors(self, label: int) -> Tensor:
         """Anchors (A, 7) of a class."""
@@ -67,8 +67,7 @@ class HVNet(nn.Module):
         maps = self(points, sample, batch_size)
         samples = []
         for b in range(batch_size):
-            own = [HeadMaps(*(None if part is None else part[b] for part in of_class)) for of_class in maps]
-            parts = [self._detect_class(label, of_class) for label, of_class in enumerate(own)]
+            parts = [self._detect_class(label, of_class.of_sample(b)) for label, of_class in enumerate(maps)]
             samples.append(Detections(*(torch.cat(column) for column in zip(*parts, strict=True))))
         return samples
 

@@ -3,6 +3,7 @@
 import functools
 import os
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import warp as wp
@@ -31,7 +32,7 @@ def start() -> None:
         os.close(silence)
 
 
-def array(tensor: Tensor, lanes: int = 0) -> wp.array:
+def array(tensor: Tensor, lanes: int = 0) -> Any:
     """A Warp view of a contiguous tensor; with lanes > 0 its last dimension, (.., lanes), becomes one vector."""
     start()
     dtype = None
@@ -40,7 +41,7 @@ def array(tensor: Tensor, lanes: int = 0) -> wp.array:
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
-def channels(tensor: Tensor, lanes: int) -> wp.array:
+def channels(tensor: Tensor, lanes: int) -> Any:
     """A Warp view (N, C / lanes) of vectors over a contiguous channels-last tensor (N, C)."""
     rows, count = tensor.shape
     return array(tensor.view(rows, count // lanes, lanes), lanes)

@@ -2,6 +2,7 @@
 
 import math
 from contextlib import AbstractContextManager, nullcontext
+from typing import Any
 
 import torch
 import warp as wp
@@ -79,6 +80,6 @@ def raycast(
     return distance, face, normal
 
 
-def _vectors(tensor: Tensor) -> wp.array:
+def _vectors(tensor: Tensor) -> Any:
     """A Warp view (N,) of vec3 over a tensor (N, 3) float32."""
     return wp.from_torch(tensor.detach().contiguous(), dtype=wp.vec3, requires_grad=False)

@@ -24,7 +24,7 @@ class Voxels(NamedTuple):
     """The voxels of one scale; see voxel.Voxels. Here they are numbered by ascending cursor."""
 
     cursor: Tensor  # (V,) int64
-    index: Tensor  # (K,) int64
+    voxel: Tensor  # (K,) int64
     starts: Tensor  # (V + 1,) int64
     order: Tensor | None  # (K,) int64
 

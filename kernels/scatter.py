@@ -28,7 +28,7 @@ from hvnet.kernels.launch import (
 class Segments(NamedTuple):
     """The points of every voxel: voxel j owns order[starts[j]:starts[j + 1]], in ascending order of the points."""
 
-    index: Tensor  # (N,) int64, the voxel of each point
+    voxel: Tensor  # (N,) int64, the voxel of each point
     starts: Tensor  # (V + 1,) int64
     order: Tensor | None  # (N,) int64, points sorted by voxel; None: they already are
 
@@ -64,18 +64,18 @@ def gather(src: Tensor, index: Tensor) -> Tensor:
 
 def segment_max(src: Tensor, voxels: Segments) -> tuple[Tensor, Tensor]:
     """`scatter_max` over segments that are at hand: src (N, C) gives values and arg-max (V, C)."""
-    return _segment_max(src, voxels.index, voxels.order, voxels.starts)
+    return _segment_max(src, voxels.voxel, voxels.order, voxels.starts)
 
 
 def segment_mean(src: Tensor, voxels: Segments) -> Tensor:
     """`scatter_mean` over segments that are at hand: src (N, C) gives (V, C)."""
     count = voxels.starts.diff().clamp(min=1).unsqueeze(1)
-    return _segment_sum(src, voxels.index, voxels.order, voxels.starts) / count
+    return _segment_sum(src, voxels.voxel, voxels.order, voxels.starts) / count
 
 
 def segment_gather(src: Tensor, voxels: Segments) -> Tensor:
     """`gather` over segments that are at hand: src (V, C) gives (N, C)."""
-    return _gather(src, voxels.index, voxels.order, voxels.starts)
+    return _gather(src, voxels.voxel, voxels.order, voxels.starts)
 
 
 def _checked_segments(src: Tensor, index: Tensor, dim_size: int) -> Segments:
@@ -169,7 +169,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
     return SimpleNamespace(maximum=maximum, maximum_backward=maximum_backward, total=total)
 
 
-def _order_array(order: Tensor | None, like: Tensor) -> wp.array:
+def _order_array(order: Tensor | None, like: Tensor) -> Any:
     return array(like.new_empty(0) if order is None else order.contiguous())
 
 

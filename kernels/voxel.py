@@ -32,21 +32,6 @@ class Voxels(NamedTuple):
     cursor: Tensor  # (V,) int64, Eq. 1 plus sample * N_L * N_W
     segments: Segments
 
-    @property
-    def index(self) -> Tensor:
-        """The voxel of each kept point, (K,) int64."""
-        return self.segments.index
-
-    @property
-    def starts(self) -> Tensor:
-        """Where each voxel's segment starts, (V + 1,) int64."""
-        return self.segments.starts
-
-    @property
-    def order(self) -> Tensor | None:
-        """The kept points sorted by voxel, (K,) int64; None: they already are."""
-        return self.segments.order
-
 
 class VoxelIndex(NamedTuple):
     """The points that lie inside every grid, in a new order, and their voxels at every scale."""

@@ -46,13 +46,13 @@ def check_index(
     assert torch.equal(order.sort().values, expected.order)
     assert len(actual.scales) == len(grids)
     for grid, voxels, twin in zip(grids, actual.scales, expected.scales, strict=True):
-        cursor, index, starts = voxels.cursor.cpu(), voxels.index.cpu(), voxels.starts.cpu()
+        cursor, index, starts = voxels.cursor.cpu(), voxels.segments.voxel.cpu(), voxels.segments.starts.cpu()
         assert cursor.dtype == index.dtype == starts.dtype == torch.int64
         assert torch.equal(cursor.sort().values, twin.cursor)
         assert torch.equal(cursor[index], reference.cursors(points, sample, grid)[order])
         assert torch.equal(starts.diff(), torch.bincount(index, minlength=len(cursor)))
         assert starts[0] == 0
-        segments = torch.arange(len(order)) if voxels.order is None else voxels.order.cpu()
+        segments = torch.arange(len(order)) if voxels.segments.order is None else voxels.segments.order.cpu()
         assert segments.dtype == torch.int64
         assert torch.equal(index[segments], torch.arange(len(cursor)).repeat_interleave(starts.diff()))
         assert torch.equal(segments, index.argsort(stable=True))  # so ascending within each voxel
@@ -272,10 +272,10 @@ def test_few_points(scales: tuple[float, ...], device: torch.device) -> None:
     grids = grids_of(scales)
     index = check_index(torch.zeros(0, 4), zeros(0), 2, grids, device)
     assert len(index.order) == 0
-    assert all(voxels.starts.tolist() == [0] for voxels in index.scales)
+    assert all(voxels.segments.starts.tolist() == [0] for voxels in index.scales)
     index = check_index(at((5, 5, 0)), torch.tensor([1]), 2, grids, device)
     assert index.order.tolist() == [0]
-    assert all(voxels.starts.tolist() == [0, 1] for voxels in index.scales)
+    assert all(voxels.segments.starts.tolist() == [0, 1] for voxels in index.scales)
     assert len(check_index(at((-5, 5, 0), (5, 5, NAN)), zeros(2), 1, grids, device).order) == 0  # none kept
     assert check_index(at((-5, 5, 0), (5, 5, 0), (5, 99, 0)), zeros(3), 1, grids, device).order.tolist() == [1]
     assert len(check_index(torch.zeros(0, 4), zeros(0), 0, grids, device).order) == 0  # no sample at all
@@ -287,7 +287,7 @@ def test_a_million_points_in_one_voxel(scales: tuple[float, ...], device: torch.
     points = at((5.1, 5.1, 0)).repeat(count, 1)
     points[:, :2] += torch.rand(count, 2, generator=torch.Generator().manual_seed(0)) * 0.08
     index = check_index(points, zeros(count), 1, grids_of(scales), device)
-    assert all(voxels.starts.tolist() == [0, count] for voxels in index.scales)
+    assert all(voxels.segments.starts.tolist() == [0, count] for voxels in index.scales)
 
 
 @pytest.mark.parametrize(
@@ -322,7 +322,7 @@ def test_same_bits_on_every_run(scales: tuple[float, ...], device: torch.device)
         index = voxel.voxel_index(points.to(device), sample.to(device), 2, grids)
         parts = [index.order]
         for voxels in index.scales:
-            parts += [voxels.cursor, voxels.index, voxels.starts] + ([] if voxels.order is None else [voxels.order])
+            parts += [voxels.cursor, voxels.segments.voxel, voxels.segments.starts] + ([] if voxels.segments.order is None else [voxels.segments.order])
         return [part.cpu() for part in parts]
 
     for first, second, on_cpu in zip(results(device), results(device), results(torch.device("cpu")), strict=True):
@@ -338,7 +338,7 @@ def test_order_of_points_does_not_number_voxels(scales: tuple[float, ...], devic
     shuffled = voxel.voxel_index(points[shuffle], sample, 1, grids)
     for first, second in zip(ordered.scales, shuffled.scales, strict=True):
         assert torch.equal(first.cursor, second.cursor)
-        assert torch.equal(first.starts, second.starts)
+        assert torch.equal(first.segments.starts, second.segments.starts)
 
 
 def test_layout_does_not_matter(device: torch.device) -> None:
@@ -351,7 +351,7 @@ def test_layout_does_not_matter(device: torch.device) -> None:
         assert torch.equal(voxel.cursors(view, long[::2], grid), voxel.cursors(points, sample, grid))
         index, expected = voxel.voxel_index(view, long[::2], 2, [grid]), voxel.voxel_index(points, sample, 2, [grid])
         assert torch.equal(index.order, expected.order)
-        assert torch.equal(index.scales[0].index, expected.scales[0].index)
+        assert torch.equal(index.scales[0].segments.voxel, expected.scales[0].segments.voxel)
     of_one_sample = torch.ones(1, dtype=torch.int64, device=device).expand(1000)
     assert torch.equal(voxel.cursors(points, of_one_sample, grid), voxel.cursors(points, of_one_sample.clone(), grid))
 
