@@ -3,6 +3,7 @@ are refused with the dotted key. Defaults are the paper's (Sec. 4.1), see config
 
 import dataclasses
 import math
+import sys
 import types
 import typing
 from collections.abc import Sequence
@@ -135,7 +136,7 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
         raise InputError(f"{path}: cannot be read ({error}); give an existing YAML file") from error
     try:
         tree = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: 2024-13-01 looks like a date
         raise InputError(f"{path}: is no valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(tree, dict):
         raise InputError(f"{path}: want a mapping with the keys {', '.join(_keys(Config))}")
@@ -176,7 +177,7 @@ def _override(tree: dict[str, Any], override: str) -> None:
             raise InputError(f"--set {override}: {parent} is no group of keys")
     try:
         node[last] = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:
         raise InputError(f"--set {override}: {text!r} is no valid YAML value") from error
 
 
@@ -225,7 +226,7 @@ def _build(kind: Any, value: Any, key: str, source: str) -> Any:
             _build(inner[0], name, key, source): _build(inner[1], item, f"{key}.{name}", source)
             for name, item in value.items()
         }
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+    if kind is float and isinstance(value, int) and not isinstance(value, bool) and abs(value) <= sys.float_info.max:
         return float(value)
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         hint = ""
@@ -300,6 +301,8 @@ def _check(config: Config, source: str) -> None:
         want(getattr(train, key) >= 0, f"train.{key}", "0 or more", getattr(train, key))
     for key in ("learning_rate", "warmup_ratio", "decay_ratio", "gradient_clip"):
         want(getattr(train, key) > 0, f"train.{key}", "above 0", getattr(train, key))
+    want(train.seed < 2**63, "train.seed", "below 2**63", train.seed)
+    want(min(train.decay_epochs, default=1) > 0, "train.decay_epochs", "epochs above 0", list(train.decay_epochs))
     if config.synthetic is not None:
         for key in ("train_frames", "val_frames"):
             want(getattr(config.synthetic, key) > 0, f"synthetic.{key}", "1 or more", getattr(config.synthetic, key))

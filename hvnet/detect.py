@@ -55,6 +55,8 @@ def find_sources(inputs: Sequence[Path], split: str | None) -> list[Source]:
     sources: list[Source] = []
     for path in inputs:
         if path.is_file():
+            if path.suffix not in SUFFIXES:
+                raise InputError(f"{path}: unknown kind of file; known: {', '.join(SUFFIXES)}")
             sources.append(Source(path.stem, path, None))
         elif (path / "training").is_dir() or (path / "testing").is_dir():
             sources += _kitti_sources(path, split)
@@ -124,23 +126,24 @@ def csv_rows(name: str, found: Detections, classes: Sequence[str]) -> Iterator[l
 
 def detect(detector: Detector, sources: Sequence[Source], out: Path, pictures: int) -> int:
     """Writes results/NAME.txt, boxes.csv and the first few pictures/NAME.png; returns the number of boxes."""
-    (out / "results").mkdir(parents=True, exist_ok=True)
     total = 0
-    with (out / "boxes.csv").open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow(["cloud", "class", "score", "x", "y", "z", "length", "width", "height", "yaw"])
-        for k, source in enumerate(tqdm(sources, desc="detecting", unit="cloud", dynamic_ncols=True)):
-            cloud = read_source(source, detector.classes)
-            for note in cloud.notes:
-                tqdm.write(note)
-            found = Detections(*(part.cpu() for part in detector(cloud.points)))
-            write_labels(out / "results" / f"{source.name}.txt", result_rows(found, cloud, detector.classes))
+    for k, source in enumerate(tqdm(sources, desc="detecting", unit="cloud", dynamic_ncols=True)):
+        cloud = read_source(source, detector.classes)
+        for note in cloud.notes:
+            tqdm.write(note)
+        found = Detections(*(part.cpu() for part in detector(cloud.points)))
+        (out / "results").mkdir(parents=True, exist_ok=True)  # not before the first cloud is read
+        write_labels(out / "results" / f"{source.name}.txt", result_rows(found, cloud, detector.classes))
+        with (out / "boxes.csv").open("a", newline="", encoding="utf-8") as file:
+            table = csv.writer(file)
+            if k == 0:
+                table.writerow(["cloud", "class", "score", "x", "y", "z", "length", "width", "height", "yaw"])
             table.writerows(csv_rows(source.name, found, detector.classes))
-            if k < pictures:
-                point_range = detector.model.config.encoder.point_range
-                path = out / "pictures" / f"{source.name}.png"
-                draw_bev(path, cloud.points, point_range, cloud.truth, *found, detector.classes, source.name)
-            total += len(found.boxes)
+        if k < pictures:
+            point_range = detector.model.config.encoder.point_range
+            path = out / "pictures" / f"{source.name}.png"
+            draw_bev(path, cloud.points, point_range, cloud.truth, *found, detector.classes, source.name)
+        total += len(found.boxes)
     return total
 
 

@@ -47,7 +47,9 @@ def draw_bev(
             handles.append(axes.add_collection(_outlines(boxes[own], colour, 1.2, f"{name} ({int(own.sum())})")))
             for box, score in zip(boxes[own].tolist(), scores[own].tolist(), strict=True):
                 reach = max(box[3], box[4]) / 2
-                axes.text(-box[1], box[0] + reach + 0.3, f"{score:.2f}", color=colour, fontsize=6, ha="center")
+                axes.text(
+                    -box[1], box[0] + reach + 0.3, f"{score:.2f}", color=colour, fontsize=6, ha="center", clip_on=True
+                )
     axes.set_xlim(-y_max, -y_min)
     axes.set_ylim(x_min, x_max)
     axes.set_aspect("equal")

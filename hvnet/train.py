@@ -18,7 +18,7 @@ from hvnet.cli import InputError, run_command
 from hvnet.config import Config, TrainConfig, config_to_dict, load_config
 from hvnet.data.augment import augment
 from hvnet.data.database import FILE_NAME, Database, build_database, read_database, write_database
-from hvnet.data.kitti import Frame, detections_to_labels, read_frame, read_split
+from hvnet.data.kitti import CLASSES, Frame, detections_to_labels, read_frame, read_split
 from hvnet.data.synthetic import Options, generate
 from hvnet.draw import draw_bev
 from hvnet.evaluate import evaluate, format_table
@@ -101,6 +101,14 @@ def learning_rate(config: TrainConfig, step: int, epoch: int) -> float:
     return decayed
 
 
+def read_batches(loader: DataLoader) -> Iterator[Batch]:
+    """The batches; of a mistake that a worker finds in a file, only the last line of its traceback is passed on."""
+    try:
+        yield from loader
+    except InputError as error:
+        raise InputError(str(error).strip().splitlines()[-1].removeprefix("hvnet.cli.InputError: ")) from error
+
+
 def train_epoch(
     model: HVNet, optimizer: torch.optim.Optimizer, loader: DataLoader, epoch: int, step: int, device: torch.device
 ) -> tuple[dict[str, float], int]:
@@ -109,18 +117,20 @@ def train_epoch(
     model.train()
     sums: dict[str, Tensor] = {}
     count = 0
-    bar = tqdm(loader, desc=f"epoch {epoch + 1}/{config.epochs}", unit="batch", leave=False, dynamic_ncols=True)
+    title = f"epoch {epoch + 1}/{config.epochs}"
+    bar = tqdm(read_batches(loader), total=len(loader), desc=title, unit="batch", leave=False, dynamic_ncols=True)
     for batch in bar:
         for group in optimizer.param_groups:
             group["lr"] = learning_rate(config, step, epoch)
         batch = batch.to(device)
         terms = model.loss(model(batch.points, batch.sample, len(batch.boxes)), batch.boxes, batch.labels)
         loss = torch.stack(list(terms.values())).sum()
-        if not math.isfinite(loss.item()):
-            raise InputError(f"the loss is {loss.item()} at step {step}; lower train.learning_rate and --resume")
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(model.parameters(), config.gradient_clip)
+        norm = torch.nn.utils.clip_grad_norm_(model.parameters(), config.gradient_clip)
+        if not math.isfinite(loss.item() + norm.item()):
+            what = f"the loss is {loss.item()} and its gradient's norm {norm.item()} at step {step}"
+            raise InputError(f"{what}; lower train.learning_rate and --resume")
         optimizer.step()
         step, count = step + 1, count + 1
         for name, term in {"loss": loss, **terms}.items():
@@ -176,8 +186,9 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
     first_epoch, step = restore(out / "checkpoint.pt", model, optimizer) if resume else (0, 0)
     print(f"{len(train_ids)} frames to train, {len(val_ids)} to validate, on {device}; the run is {out}", flush=True)
 
+    out.mkdir(parents=True, exist_ok=True)
     metrics = keep_metrics(out / "metrics.jsonl", first_epoch)
-    board = SummaryWriter(str(out / "tensorboard"), purge_step=first_epoch)
+    board = SummaryWriter(str(out / "tensorboard"), purge_step=first_epoch + 1)
     for epoch in range(first_epoch, config.train.epochs):
         order.epoch = epoch
         losses, step = train_epoch(model, optimizer, loader, epoch, step, device)
@@ -194,6 +205,7 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
             }
         for name, value in flatten(record):
             board.add_scalar(name, value, epoch + 1)
+        board.flush()
         content = {
             "config": config_to_dict(config),
             "model": model.state_dict(),
@@ -270,11 +282,10 @@ def flatten(record: Any, key: str = "") -> Iterator[tuple[str, float]]:
 
 
 def keep_metrics(path: Path, epochs: int) -> Path:
-    """Leaves the lines of the epochs that are done: a run may have stopped after a line, before its checkpoint."""
+    """Leaves a line for each epoch that is done: a run may have stopped in or after a line, before its checkpoint."""
     if path.is_file():
-        lines = path.read_text(encoding="utf-8").splitlines()
-        kept = [line for line in lines if line.endswith("}") and json.loads(line)["epoch"] <= epochs]
-        path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+        path.write_text("".join(lines[:epochs]), encoding="utf-8")
     return path
 
 
@@ -312,6 +323,10 @@ def main(arguments: Sequence[str] | None) -> None:
     options = parser.parse_args(arguments)
 
     config = load_config(options.config, options.set)
+    for k, entry in enumerate(config.head.classes):
+        if entry.name not in CLASSES:
+            where = f"{options.config}: head.classes[{k}].name"
+            raise InputError(f"{where}: unknown class '{entry.name}'; known are {', '.join(CLASSES)}")
     device = select_device(options.device)
     out = choose_out(options.out, options.config, options.resume)
     root = options.data
@@ -321,7 +336,6 @@ def main(arguments: Sequence[str] | None) -> None:
         scenes, reach = config.synthetic, config.encoder.point_range[3]
         root = out.parent / f"scenes-{scenes.train_frames}-{scenes.val_frames}-{reach:g}m-{config.train.seed}"
         generate(root, scenes.train_frames, scenes.val_frames, config.train.seed, Options(distance=(4.0, reach - 2)))
-    out.mkdir(parents=True, exist_ok=True)
     train(config, root, out, device, options.resume)
 
 

@@ -1,5 +1,6 @@
 """Voxels of every scale: cursors (Eq. 1), one sort for all nested scales, a hash table for the others."""
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,6 +13,7 @@ from hvnet.kernels.launch import array, check_index, check_tensor, launch
 from hvnet.kernels.scatter import Segments
 
 KEY_BITS = 62  # of a sort key in int64
+OUTSIDE = wp.constant(1 << 62)  # the key of a point outside, after all others
 
 
 class Grid(NamedTuple):
@@ -38,6 +40,20 @@ class VoxelIndex(NamedTuple):
 
     order: Tensor  # (K,) int64, indices into the points given
     scales: list[Voxels]
+
+
+class NestedIndex(NamedTuple):
+    """The voxels of S nested scales in arrays of fixed size, so that no length has to be read from the device.
+
+    Of N points the first `kept` in the new order are inside every grid; scale s has `count[s]` voxels. What lies beyond
+    is not set.
+    """
+
+    order: Tensor  # (N,) int64, indices into the points given
+    voxel: Tensor  # (S, N) int64, the voxel of each point in the new order
+    starts: Tensor  # (S, N + 1) int64
+    cursor: Tensor  # (S, N) int64
+    count: Tensor  # (S + 1,) int64: voxels of every scale, then the points kept
 
 
 def make_grid(point_range: Sequence[float], voxel_size: Sequence[float], scale: float, multiple: int = 1) -> Grid:
@@ -95,18 +111,72 @@ def voxel_index(points: Tensor, sample: Tensor, batch_size: int, grids: Sequence
     for grid in grids:
         if batch_size * grid.shape[0] * grid.shape[1] >= 2**63:
             raise ValueError(f"grids: {batch_size} samples of {grid.shape} cells have cursors beyond int64")
+    if is_nested(grids, batch_size):
+        nested = nested_index(points, sample, grids)
+        *counts, kept = nested.count.tolist()
+        scales = [
+            Voxels(nested.cursor[s, :v], Segments(nested.voxel[s, :kept], nested.starts[s, : v + 1], None))
+            for s, v in enumerate(counts)
+        ]
+        return VoxelIndex(nested.order[:kept], scales)
     by_scale = [cursors(points, sample, grid) for grid in grids]
     inside = by_scale[0].ge(0)
     for cursor in by_scale[1:]:
         inside &= cursor.ge(0)
-    kept = inside.nonzero().squeeze(1)
-    finest = min(range(len(grids)), key=lambda k: grids[k].cell)
-    bits = max(max(grids[finest].cells) - 1, 1).bit_length()
-    nested = all(_nests(grid, grids[finest]) for grid in grids)
-    if not (nested and 2 * bits + batch_size.bit_length() <= KEY_BITS):
-        return VoxelIndex(kept, [_hashed_voxels(cursor[kept]) for cursor in by_scale])
-    order = kept[torch.sort(_morton_keys(by_scale[finest][kept], grids[finest], bits), stable=True).indices]
-    return VoxelIndex(order, [_sorted_voxels(cursor[order]) for cursor in by_scale])
+    order = inside.nonzero().squeeze(1)
+    return VoxelIndex(order, [_hashed_voxels(cursor[order]) for cursor in by_scale])
+
+
+def is_nested(grids: Sequence[Grid], batch_size: int) -> bool:
+    """Whether one sort serves all grids: each cell a power of two times the finest, to the bit, and keys that fit."""
+    finest = min(grids, key=lambda grid: grid.cell)
+    fits = 2 * _bits(finest) + batch_size.bit_length() <= KEY_BITS
+    return fits and all(_level(grid, finest) is not None for grid in grids)
+
+
+def nested_index(points: Tensor, sample: Tensor, grids: Sequence[Grid]) -> NestedIndex:
+    """The voxels of points (N, 4) float32 of samples (N,) int64 in grids that nest; nothing is read from the device."""
+    finest = min(grids, key=lambda grid: grid.cell)
+    levels = [_level(grid, finest) or 0 for grid in grids]
+    bits, count, device = _bits(finest), len(points), points.device
+    keys = torch.empty(count, dtype=torch.int64, device=device)
+    # inside every grid: the finest index, cut to a coarser grid's cells, is compared with each
+    cells = wp.vec2i(*(min(g.cells[axis] << level for g, level in zip(grids, levels, strict=True)) for axis in (0, 1)))
+    height = wp.vec2(max(grid.z_min for grid in grids), min(grid.z_max for grid in grids))
+    low, reciprocal = wp.vec2(finest.x_min, finest.y_min), wp.vec2(1.0 / finest.cell[0], 1.0 / finest.cell[1])
+    inputs = [array(points.contiguous()), array(sample.contiguous()), low, height, reciprocal, cells]
+    launch(_key_kernel, count, [*inputs, wp.int64(2 * bits), array(keys)], device)
+    keys, order = torch.sort(keys, stable=True)
+
+    first = torch.empty(len(grids), count, dtype=torch.int64, device=device)
+    scales = array(_scales(tuple(grids), tuple(levels), device))
+    launch(_first_kernel, first.shape, [array(keys), scales, array(first)], device)
+    voxel = first.cumsum(dim=1) - 1
+    starts = torch.zeros(len(grids), count + 1, dtype=torch.int64, device=device)
+    cursor = torch.empty(len(grids), count, dtype=torch.int64, device=device)
+    counts = torch.zeros(len(grids) + 1, dtype=torch.int64, device=device)
+    outputs = [array(starts), array(cursor), array(counts)]
+    launch(_fill_kernel, first.shape, [array(keys), scales, array(voxel), wp.int64(2 * bits), *outputs], device)
+    return NestedIndex(order, voxel, starts, cursor, counts)
+
+
+@functools.cache
+def _scales(grids: tuple[Grid, ...], levels: tuple[int, ...], device: torch.device) -> Tensor:
+    """Of every scale (S, 3): bits of a Morton key to drop, N_L, N_W. Kept, so that a frame copies nothing to a GPU."""
+    rows = [(2 * level, *grid.shape) for grid, level in zip(grids, levels, strict=True)]
+    return torch.tensor(rows, dtype=torch.int64, device=device)
+
+
+def _bits(grid: Grid) -> int:
+    return max(max(grid.cells) - 1, 1).bit_length()
+
+
+def _level(grid: Grid, finest: Grid) -> int | None:
+    """log2 of the grid's cell over the finest cell, if it is whole and the grids start at the same place."""
+    mantissa, exponent = math.frexp(grid.cell[0] / finest.cell[0])
+    same_ratio = grid.cell[1] / finest.cell[1] == grid.cell[0] / finest.cell[0]
+    same_origin = (grid.x_min, grid.y_min) == (finest.x_min, finest.y_min)
+    return exponent - 1 if mantissa == 0.5 and same_ratio and same_origin else None
 
 
 def hash_index(cursor: Tensor) -> tuple[Tensor, Tensor]:
@@ -126,28 +196,6 @@ def hash_index(cursor: Tensor) -> tuple[Tensor, Tensor]:
     return unique, table[slot]
 
 
-def _nests(grid: Grid, finest: Grid) -> bool:
-    """Whether the cells of a grid are a power of two times the finest ones, to the bit, so that runs stay runs."""
-    ratio = grid.cell[0] / finest.cell[0]
-    same_origin = (grid.x_min, grid.y_min) == (finest.x_min, finest.y_min)
-    return same_origin and math.frexp(ratio)[0] == 0.5 and grid.cell[1] / finest.cell[1] == ratio
-
-
-def _morton_keys(cursor: Tensor, grid: Grid, bits: int) -> Tensor:
-    keys = torch.empty_like(cursor)
-    shape = wp.int64(grid.shape[0]), wp.int64(grid.shape[1])
-    launch(_morton_kernel, len(cursor), [array(cursor), *shape, bits, array(keys)], cursor.device)
-    return keys
-
-
-def _sorted_voxels(cursor: Tensor) -> Voxels:
-    """Voxels of points whose cursors (K,) stand in runs."""
-    first = torch.ones(len(cursor) + 1, dtype=torch.bool, device=cursor.device)
-    first[1:-1] = cursor[1:] != cursor[:-1]
-    starts = first.nonzero().squeeze(1) if len(cursor) else first.new_zeros(1, dtype=torch.int64)
-    return Voxels(cursor[starts[:-1]], Segments(first[:-1].cumsum(0) - 1, starts, None))
-
-
 def _hashed_voxels(cursor: Tensor) -> Voxels:
     unique, index = hash_index(cursor)
     values, order = torch.sort(index, stable=True)
@@ -158,6 +206,13 @@ def _hashed_voxels(cursor: Tensor) -> Voxels:
 def _check_points(points: Tensor, sample: Tensor) -> None:
     check_tensor("points", points, (torch.float32,), (None, 4))
     check_tensor("sample", sample, (torch.int64,), (len(points),), like=points)
+
+
+@wp.func
+def _is_inside(x: float, y: float, z: float, reflectance: float, height: wp.vec2, cells: wp.vec2i):
+    """Whether the index (x, y) is a cell and z in range. Infinities and NaN fail as floats and are never cast."""
+    inside = x >= 0.0 and x < float(cells[0]) and y >= 0.0 and y < float(cells[1])
+    return inside and z >= height[0] and z < height[1] and wp.isfinite(reflectance)
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -177,31 +232,92 @@ def _cursor_kernel(
     y = wp.floor((points[i, 1] - low[1]) * reciprocal[1])
     z = points[i, 2]
     value = wp.int64(-1)
-    # compared as floats: infinities and NaN fail here and are never cast
-    inside = x >= 0.0 and x < float(cells[0]) and y >= 0.0 and y < float(cells[1])
-    if inside and z >= height[0] and z < height[1] and wp.isfinite(points[i, 3]):
+    if _is_inside(x, y, z, points[i, 3], height, cells):
         value = (sample[i] * n_l + wp.int64(x)) * n_w + wp.int64(y)
     cursor[i] = value
 
 
 @wp.func
-def _spread(value: wp.int64, bits: int):
-    """The bits of a value, one place apart."""
-    spread = wp.int64(0)
-    for bit in range(bits):
-        spread = spread | (((value >> wp.int64(bit)) & wp.int64(1)) << wp.int64(2 * bit))
-    return spread
+def _spread(value: wp.int64):
+    """The 31 low bits of a value, one place apart."""
+    v = value
+    v = (v | (v << wp.int64(16))) & wp.int64(0x0000FFFF0000FFFF)
+    v = (v | (v << wp.int64(8))) & wp.int64(0x00FF00FF00FF00FF)
+    v = (v | (v << wp.int64(4))) & wp.int64(0x0F0F0F0F0F0F0F0F)
+    v = (v | (v << wp.int64(2))) & wp.int64(0x3333333333333333)
+    return (v | (v << wp.int64(1))) & wp.int64(0x5555555555555555)
+
+
+@wp.func
+def _collect(value: wp.int64):
+    """Every other bit of a value, side by side: the inverse of _spread."""
+    v = value & wp.int64(0x5555555555555555)
+    v = (v | (v >> wp.int64(1))) & wp.int64(0x3333333333333333)
+    v = (v | (v >> wp.int64(2))) & wp.int64(0x0F0F0F0F0F0F0F0F)
+    v = (v | (v >> wp.int64(4))) & wp.int64(0x00FF00FF00FF00FF)
+    v = (v | (v >> wp.int64(8))) & wp.int64(0x0000FFFF0000FFFF)
+    return (v | (v >> wp.int64(16))) & wp.int64(0x7FFFFFFF)
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _morton_kernel(
-    cursor: wp.array(dtype=wp.int64), n_l: wp.int64, n_w: wp.int64, bits: int, keys: wp.array(dtype=wp.int64)
+def _key_kernel(
+    points: wp.array2d(dtype=wp.float32),
+    sample: wp.array(dtype=wp.int64),
+    low: wp.vec2,
+    height: wp.vec2,
+    reciprocal: wp.vec2,
+    cells: wp.vec2i,
+    bits: wp.int64,
+    keys: wp.array(dtype=wp.int64),
 ):
     i = wp.tid()
-    y = cursor[i] % n_w
-    row = cursor[i] / n_w
-    sample = row / n_l
-    keys[i] = (sample << wp.int64(2 * bits)) | (_spread(row % n_l, bits) << wp.int64(1)) | _spread(y, bits)
+    x = wp.floor((points[i, 0] - low[0]) * reciprocal[0])
+    y = wp.floor((points[i, 1] - low[1]) * reciprocal[1])
+    z = points[i, 2]
+    key = wp.int64(OUTSIDE)
+    if _is_inside(x, y, z, points[i, 3], height, cells):
+        key = (sample[i] << bits) | (_spread(wp.int64(x)) << wp.int64(1)) | _spread(wp.int64(y))
+    keys[i] = key
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _first_kernel(
+    keys: wp.array(dtype=wp.int64), scales: wp.array2d(dtype=wp.int64), first: wp.array2d(dtype=wp.int64)
+):
+    """1 for the first point of every voxel among the sorted keys."""
+    s, i = wp.tid()
+    is_first = wp.int64(0)
+    if keys[i] != wp.int64(OUTSIDE) and (i == 0 or (keys[i] ^ keys[i - 1]) >> scales[s, 0] != wp.int64(0)):
+        is_first = wp.int64(1)
+    first[s, i] = is_first
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _fill_kernel(
+    keys: wp.array(dtype=wp.int64),
+    scales: wp.array2d(dtype=wp.int64),
+    voxel: wp.array2d(dtype=wp.int64),
+    bits: wp.int64,
+    starts: wp.array2d(dtype=wp.int64),
+    cursor: wp.array2d(dtype=wp.int64),
+    counts: wp.array(dtype=wp.int64),
+):
+    s, i = wp.tid()
+    if keys[i] == wp.int64(OUTSIDE):
+        return
+    v = int(voxel[s, i])
+    if i == 0 or voxel[s, i] != voxel[s, i - 1]:
+        inner = keys[i] & ((wp.int64(1) << bits) - wp.int64(1))
+        level = scales[s, 0] / wp.int64(2)
+        x = _collect(inner >> wp.int64(1)) >> level
+        y = _collect(inner) >> level
+        starts[s, v] = wp.int64(i)
+        cursor[s, v] = ((keys[i] >> bits) * scales[s, 1] + x) * scales[s, 2] + y
+    if i + 1 == keys.shape[0] or keys[i + 1] == wp.int64(OUTSIDE):
+        starts[s, v + 1] = wp.int64(i + 1)
+        counts[s] = wp.int64(v + 1)
+        if s == 0:
+            counts[scales.shape[0]] = wp.int64(i + 1)
 
 
 @wp.kernel(enable_backward=False, module="unique")

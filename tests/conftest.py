@@ -1,10 +1,13 @@
 """Fixtures for all tests: unwritten memory is seen, the real KITTI frames are found or skipped."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
+
+from hvnet.data.synthetic import Options, generate
 
 torch.utils.deterministic.fill_uninitialized_memory = True
 torch.use_deterministic_algorithms(True)  # with it, torch.empty is filled with NaN or the largest integer
@@ -25,3 +28,20 @@ def device(request: pytest.FixtureRequest) -> torch.device:
     if request.param == "cuda" and not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     return torch.device(request.param)
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """For networks so small that threads cost more than they save: tenfold on a machine that others use as well."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="session")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A KITTI root of four generated frames to train and two to validate; tests that change it copy it."""
+    root = tmp_path_factory.mktemp("scenes") / "kitti"
+    generate(root, 4, 2, seed=0, options=Options(azimuth=41, distance=(4.0, 22.0)))
+    return root

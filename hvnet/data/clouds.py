@@ -1,5 +1,7 @@
 """Point clouds of one's own: .bin (KITTI), .npy, .pcd and .ply files as (N, 4) float32."""
 
+import struct
+import tokenize
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -19,8 +21,8 @@ REFLECTANCE = ("reflectance", "intensity", "reflectivity", "i", "scalar_intensit
 def read_cloud(path: Path) -> tuple[NDArray[np.float32], list[str]]:
     """Points (N, 4) x, y, z in metres and reflectance in [0, 1] of a file, and what was changed in reading them.
 
-    A file without reflectance gets 0, one that counts it beyond 1 (to 255, say) is divided by its range's power of two;
-    points that are not finite are dropped. Raises InputError naming the file.
+    A file without reflectance gets 0, one that counts it beyond 1 is divided by 255 or, if that is too little, by
+    65535; points that are not finite are dropped. Raises InputError naming the file.
     """
     if path.suffix == ".bin":
         points = read_points(path)
@@ -37,7 +39,7 @@ def read_cloud(path: Path) -> tuple[NDArray[np.float32], list[str]]:
         notes.append(f"{path}: has no reflectance; 0 was taken, and detection suffers from it")
     highest = float(points[:, 3].max(initial=0))
     if highest > 1:
-        scale = 2.0 ** np.ceil(np.log2(highest + 1)) - 1  # 255 for 8 bits, 65535 for 16
+        scale = next((full for full in (255.0, 65535.0) if highest <= full), highest)  # 8 bits, 16 bits, else unknown
         points[:, 3] /= scale
         notes.append(f"{path}: reflectance up to {highest:g} was divided by {scale:g}")
     return points, notes
@@ -45,13 +47,12 @@ def read_cloud(path: Path) -> tuple[NDArray[np.float32], list[str]]:
 
 def _read_npy(path: Path) -> NDArray[np.float32]:
     try:
-        points = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        with path.open("rb") as file:  # np.load would take other formats, too
+            points = np.lib.format.read_array(file, allow_pickle=False)
+    except (OSError, ValueError, MemoryError, tokenize.TokenError) as error:
         raise InputError(f"{path}: cannot be read as .npy ({error}); save it with numpy.save") from error
-    if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
-        raise InputError(
-            f"{path}: want numbers (N, 3) or (N, 4), got {getattr(points, 'shape', type(points).__name__)}"
-        )
+    if points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
+        raise InputError(f"{path}: want numbers (N, 3) or (N, 4), got {points.dtype} {points.shape}")
     return points[:, :4].astype(np.float32)
 
 
@@ -63,7 +64,7 @@ def _read_fields(path: Path) -> dict[str, NDArray]:
             return {name: cloud.pc_data[name].reshape(-1) for name in cloud.fields}
         vertices = PlyData.read(str(path))["vertex"]
         return {field.name: np.asarray(vertices[field.name]) for field in vertices.properties}
-    except (OSError, ValueError, KeyError, IndexError, RuntimeError, PlyParseError) as error:
+    except (OSError, ValueError, KeyError, IndexError, RuntimeError, struct.error, PlyParseError) as error:
         what = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: cannot be read as {path.suffix} ({what}); write it again or convert it") from error
 

@@ -1,0 +1,309 @@
+"""Detection on files, folders and KITTI roots: the same boxes from every kind of file, results that KITTI can read."""
+
+import csv
+import dataclasses
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from plyfile import PlyData, PlyElement
+from pypcd4 import Encoding, PointCloud
+
+from hvnet.boxes import limit_angle
+from hvnet.cli import InputError
+from hvnet.config import config_to_dict, load_config
+from hvnet.data.kitti import Calibration, boxes_to_lidar, project_boxes, read_calibration, read_labels, read_points
+from hvnet.detect import NO_IMAGE, Cloud, csv_rows, main, result_rows
+from hvnet.model import Detections, HVNet, load, save_checkpoint
+
+ROOT = Path(__file__).resolve().parents[1]
+TINY = [
+    "encoder.point_range=[0, -6.4, -3, 25.6, 6.4, 2]",
+    "encoder.feature_channels=4",
+    "encoder.image_channels=8",
+    "backbone.widths=[8, 8, 8]",
+    "backbone.layers=[2, 2, 2]",
+    "backbone.fusion_channels=8",
+    "head.score_threshold=0.0",
+    "head.candidates=100",
+    "head.detections=8",
+]
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An untrained detector that reports its 8 best boxes a class, whatever it sees."""
+    torch.manual_seed(0)
+    config = load_config(ROOT / "configs" / "demo.yaml", TINY)
+    model = HVNet(config)
+    for head in model.heads:
+        torch.nn.init.normal_(head.score.weight, std=0.05)
+    path = tmp_path_factory.mktemp("model") / "checkpoint.pt"
+    save_checkpoint(path, {"config": config_to_dict(config), "model": model.state_dict()})
+    return path
+
+
+@pytest.fixture(scope="module")
+def cloud(scenes: Path) -> NDArray[np.float32]:
+    points = read_points(scenes / "training" / "velodyne" / "000000.bin")
+    points[:, 3] = (points[:, 3] * 255).round() / 255
+    points[0, 3] = 1.0
+    return points
+
+
+def detect(checkpoint: Path, out: Path, *inputs: Path, options: tuple[str, ...] = ()) -> None:
+    arguments = [str(path) for path in inputs]
+    main([*arguments, "--checkpoint", str(checkpoint), "--out", str(out), "--device", "cpu", *options])
+
+
+def table(out: Path) -> list[dict[str, str]]:
+    with (out / "boxes.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def boxes_of(rows: list[dict[str, str]]) -> NDArray[np.float64]:
+    keys = ("x", "y", "z", "length", "width", "height", "yaw")
+    return np.array([[float(row[key]) for key in keys] for row in rows]).reshape(-1, 7)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def assert_agrees(out: Path, name: str, rows: list[dict[str, str]], calib: Calibration) -> None:
+    """The result file NAME.txt says what rows of boxes.csv say, once taken to LiDAR axes."""
+    labels = read_labels(out / "results" / f"{name}.txt", scored=True)
+    assert labels.score is not None
+    assert labels.name.tolist() == [row["class"] for row in rows]
+    np.testing.assert_allclose(labels.score, [float(row["score"]) for row in rows], rtol=0, atol=6e-5)  # 4 digits
+    difference = boxes_to_lidar(labels, calib) - boxes_of(rows)
+    difference[:, 6] = limit_angle(torch.from_numpy(difference[:, 6])).numpy()
+    # half of the last digit of the table, 1 mm, and of the file, 0.1 mm, whose axes are turned
+    assert np.abs(difference).max(initial=0) < 0.5e-3 + 1e-4
+
+
+def write_all(folder: Path, points: NDArray[np.float32]) -> list[Path]:
+    """One cloud in each of the kinds of file."""
+    folder.mkdir()
+    paths = [folder / f"as_{suffix}.{suffix}" for suffix in ("bin", "npy", "pcd", "ply")]
+    paths[0].write_bytes(points.tobytes())
+    np.save(paths[1], points)
+    PointCloud.from_xyzi_points(points).save(paths[2], encoding=Encoding.BINARY_COMPRESSED)
+    rows = np.array([tuple(row) for row in points], dtype=[(name, "f4") for name in ("x", "y", "z", "intensity")])
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(paths[3]))
+    return paths
+
+
+# --- files and folders ------------------------------------------------------------------------------------------------
+
+
+def test_every_kind_of_file_gives_the_same_boxes(
+    checkpoint: Path, cloud: NDArray[np.float32], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths = write_all(tmp_path / "clouds", cloud)
+    (tmp_path / "clouds" / "notes.txt").write_text("not a cloud")
+    detect(checkpoint, tmp_path / "files", *paths, options=("--pictures", "1"))
+    printed = capsys.readouterr().out
+    rows = table(tmp_path / "files")
+    assert f"{len(rows)} boxes in 4 clouds" in printed
+    by_name = [[list(row.values())[1:] for row in rows if row["cloud"] == path.stem] for path in paths]
+    assert len(by_name[0]) > 10
+    assert {row[0] for row in by_name[0]} == {"Car", "Pedestrian", "Cyclist"}
+    assert by_name[1:] == by_name[:1] * 3
+    results = [(tmp_path / "files" / "results" / f"{path.stem}.txt").read_bytes() for path in paths]
+    assert results[1:] == results[:1] * 3
+    assert [path.name for path in (tmp_path / "files" / "pictures").iterdir()] == ["as_bin.png"]
+    with Image.open(tmp_path / "files" / "pictures" / "as_bin.png") as image:
+        assert image.format == "PNG"
+
+    # the folder gives the same again, byte for byte
+    detect(checkpoint, tmp_path / "folder", tmp_path / "clouds", options=("--pictures", "1"))
+    assert contents(tmp_path / "folder") == contents(tmp_path / "files")
+
+
+def test_boxes_are_those_of_the_detector(checkpoint: Path, cloud: NDArray[np.float32], tmp_path: Path) -> None:
+    np.save(tmp_path / "cloud.npy", cloud)
+    detect(checkpoint, tmp_path / "out", tmp_path / "cloud.npy")
+    found = load(checkpoint, "cpu")(cloud)
+    # three decimals, and float32 of 25 m
+    np.testing.assert_allclose(boxes_of(table(tmp_path / "out")), found.boxes.numpy(), rtol=0, atol=0.501e-3)
+
+
+def test_results_without_calibration(checkpoint: Path, cloud: NDArray[np.float32], tmp_path: Path) -> None:
+    np.save(tmp_path / "cloud.npy", cloud)
+    detect(checkpoint, tmp_path / "out", tmp_path / "cloud.npy", options=("--pictures", "0"))
+    labels = read_labels(tmp_path / "out" / "results" / "cloud.txt", scored=True)
+    assert (labels.bbox == -1).all()
+    assert (labels.truncation == -1).all()
+    assert (labels.occlusion == -1).all()
+    assert (np.abs(labels.alpha) <= 3.1416).all()
+    assert_agrees(tmp_path / "out", "cloud", table(tmp_path / "out"), NO_IMAGE)
+    assert not (tmp_path / "out" / "pictures").exists()
+
+
+def test_what_was_changed_in_reading_is_said(
+    checkpoint: Path, cloud: NDArray[np.float32], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cloud = cloud.copy()
+    cloud[:7, 0] = np.nan
+    np.save(tmp_path / "cloud.npy", cloud[:, :3])
+    detect(checkpoint, tmp_path / "out", tmp_path / "cloud.npy", options=("--pictures", "0"))
+    printed = capsys.readouterr().out
+    assert printed.count("cloud.npy: 7 points that are not finite were dropped") == 1
+    assert printed.count("cloud.npy: has no reflectance") == 1
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 4)), np.array([[5, 0, -1, 0.5]]), np.full((3, 4), 500.0)])
+def test_odd_clouds(checkpoint: Path, tmp_path: Path, points: NDArray) -> None:
+    """None, one point, and none in range."""
+    np.save(tmp_path / "cloud.npy", points)
+    detect(checkpoint, tmp_path / "out", tmp_path / "cloud.npy")
+    assert (tmp_path / "out" / "pictures" / "cloud.png").is_file()
+    assert_agrees(tmp_path / "out", "cloud", table(tmp_path / "out"), NO_IMAGE)
+
+
+def test_no_detections(checkpoint: Path, cloud: NDArray[np.float32], tmp_path: Path) -> None:
+    detector = load(checkpoint, "cpu")
+    config = detector.model.config
+    config = dataclasses.replace(config, head=dataclasses.replace(config.head, score_threshold=0.99))
+    path = tmp_path / "checkpoint.pt"
+    save_checkpoint(path, {"config": config_to_dict(config), "model": detector.model.state_dict()})
+    np.save(tmp_path / "cloud.npy", cloud)
+    detect(path, tmp_path / "out", tmp_path / "cloud.npy")
+    assert table(tmp_path / "out") == []
+    assert (tmp_path / "out" / "boxes.csv").read_text().startswith("cloud,class,score,x,y,z,length,width,height,yaw")
+    assert len(read_labels(tmp_path / "out" / "results" / "cloud.txt", scored=True)) == 0
+
+
+# --- KITTI roots ------------------------------------------------------------------------------------------------------
+
+
+def test_kitti_root(checkpoint: Path, scenes: Path, tmp_path: Path) -> None:
+    detect(checkpoint, tmp_path / "all", scenes)
+    names = [f"{k:06d}" for k in range(6)]
+    assert sorted(path.stem for path in (tmp_path / "all" / "results").iterdir()) == names
+    assert sorted(path.stem for path in (tmp_path / "all" / "pictures").iterdir()) == names
+    rows = table(tmp_path / "all")
+    for name in names:
+        own = [row for row in rows if row["cloud"] == name]
+        calib = read_calibration(scenes / "training" / "calib" / f"{name}.txt")
+        bbox, visible = project_boxes(boxes_of(own), calib, (1242, 375))
+        seen = [row for row, is_seen in zip(own, visible, strict=True) if is_seen]
+        assert_agrees(tmp_path / "all", name, seen, calib)
+        labels = read_labels(tmp_path / "all" / "results" / f"{name}.txt", scored=True)
+        large = (bbox[visible, 2:] - bbox[visible, :2] < 400).all(axis=1)  # next to the camera 1 mm is many pixels
+        np.testing.assert_allclose(labels.bbox[large], bbox[visible][large], rtol=0, atol=1.0)
+        assert (labels.bbox >= 0).all()
+        assert (labels.bbox <= [1241, 374, 1241, 374]).all()
+
+    detect(checkpoint, tmp_path / "val", scenes, options=("--split", "val", "--pictures", "0"))
+    for name in names[4:]:
+        results = Path("results") / f"{name}.txt"
+        assert (tmp_path / "val" / results).read_bytes() == (tmp_path / "all" / results).read_bytes()
+    assert table(tmp_path / "val") == [row for row in rows if row["cloud"] in names[4:]]
+    assert len(list((tmp_path / "val" / "results").iterdir())) == 2
+
+
+def test_boxes_outside_the_image_are_in_the_table_alone(scenes: Path) -> None:
+    calib = read_calibration(scenes / "training" / "calib" / "000000.txt")
+    size = [4.0, 1.7, 1.5, 0.0]
+    boxes = torch.tensor([[10.0, 0.0, -1.0, *size], [-10.0, 0.0, -1.0, *size], [5.0, 12.0, -1.0, *size]])
+    found = Detections(boxes, torch.tensor([0.9, 0.8, 0.7]), torch.tensor([1, 0, 0]))
+    cloud = Cloud(torch.zeros(0, 4), torch.zeros(0, 7), calib, (1242, 375), [])
+    rows = result_rows(found, cloud, ("Car", "Van"))
+    assert rows.name.tolist() == ["Van"]
+    assert rows.score == pytest.approx([0.9])
+    assert len(result_rows(found, cloud._replace(calib=None), ("Car", "Van"))) == 3
+    assert [row[:3] for row in csv_rows("a", found, ("Car", "Van"))] == [
+        ["a", "Van", "0.9000"],
+        ["a", "Car", "0.8000"],
+        ["a", "Car", "0.7000"],
+    ]
+
+
+def test_kitti_root_without_labels(checkpoint: Path, scenes: Path, tmp_path: Path) -> None:
+    """The test set: its folder is testing, and it has no labels."""
+    root = tmp_path / "kitti"
+    for folder in ("velodyne", "calib"):
+        (root / "testing" / folder).mkdir(parents=True)
+        for path in sorted((scenes / "training" / folder).iterdir())[:2]:
+            shutil.copy(path, root / "testing" / folder)
+    (root / "ImageSets").mkdir()
+    (root / "ImageSets" / "test.txt").write_text("000001\n")
+    detect(checkpoint, tmp_path / "all", root, options=("--pictures", "1"))
+    assert len(list((tmp_path / "all" / "results").iterdir())) == 2
+    (root / "training").mkdir()
+    detect(checkpoint, tmp_path / "test", root, options=("--split", "test", "--pictures", "0"))
+    assert [path.name for path in (tmp_path / "test" / "results").iterdir()] == ["000001.txt"]
+    with pytest.raises(InputError, match=r"velodyne: holds no \.bin file"):
+        detect(checkpoint, tmp_path / "none", root)
+
+
+# --- mistakes ---------------------------------------------------------------------------------------------------------
+
+
+def test_mistakes_leave_nothing_behind(checkpoint: Path, scenes: Path, tmp_path: Path) -> None:
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    (tmp_path / "cloud.xyz").touch()
+    (tmp_path / "cut.bin").write_bytes(b"123")
+    for path in (tmp_path / "one" / "cloud.npy", tmp_path / "two" / "cloud.npy"):
+        path.parent.mkdir()
+        np.save(path, np.zeros((3, 4)))
+    good = tmp_path / "one" / "cloud.npy"
+    for inputs, message in (
+        ([tmp_path / "none"], "none: no such file or folder"),
+        ([good, tmp_path / "none.bin"], r"none\.bin: no such file or folder"),
+        ([good, tmp_path / "cloud.xyz"], r"cloud\.xyz: unknown kind of file; known: \.bin, \.npy, \.pcd, \.ply"),
+        ([tmp_path / "cut.bin"], r"cut\.bin: 3 bytes are no multiple of 16"),
+        ([empty], r"empty: holds no cloud \(\.bin, \.npy, \.pcd, \.ply\) and is no KITTI root"),
+        ([good, tmp_path / "two"], r"two.cloud\.npy: the name cloud is taken by .*one.cloud\.npy; rename one"),
+        ([good, good], r"the name cloud is taken by"),
+    ):
+        with pytest.raises(InputError, match=message):
+            detect(checkpoint, tmp_path / "out", *inputs)
+        assert not (tmp_path / "out").exists()
+    with pytest.raises(InputError, match=r"none\.txt: no such file"):
+        detect(checkpoint, tmp_path / "out", scenes, options=("--split", "none"))
+    with pytest.raises(InputError, match=r"none\.pt: no such checkpoint"):
+        detect(tmp_path / "none.pt", tmp_path / "out", good)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_is_not_empty_is_refused(checkpoint: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "cloud.npy", np.zeros((3, 4)))
+    out = tmp_path / "out"
+    detect(checkpoint, out, tmp_path / "cloud.npy")
+    before = contents(out)
+    with pytest.raises(InputError, match=r"out: is not empty; give another --out"):
+        detect(checkpoint, out, tmp_path / "cloud.npy")
+    assert contents(out) == before
+    with pytest.raises(InputError, match=re.escape("cloud.npy: is not empty")):
+        detect(checkpoint, tmp_path / "cloud.npy", tmp_path / "cloud.npy")
+
+
+def test_the_command(checkpoint: Path, tmp_path: Path) -> None:
+    def command(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", "hvnet.detect", *arguments], cwd=ROOT, capture_output=True, text=True, check=False
+        )
+
+    helped = command("--help")
+    assert helped.returncode == 0
+    assert "usage: python -m hvnet.detect" in helped.stdout
+    assert helped.stderr == ""
+
+    missing = str(tmp_path / "none.bin")
+    failed = command(missing, "--checkpoint", str(checkpoint), "--out", str(tmp_path / "out"), "--device", "cpu")
+    assert failed.returncode == 2
+    assert failed.stdout == ""
+    assert failed.stderr == f"error: {missing}: no such file or folder\n"

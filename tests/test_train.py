@@ -1,0 +1,492 @@
+"""Training end to end on a few generated frames: what is written, that it repeats bit for bit, resuming, mistakes."""
+
+import contextlib
+import dataclasses
+import io
+import json
+import math
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch.utils.data import DataLoader
+
+from hvnet.cli import InputError
+from hvnet.config import Config, TrainConfig, load_config
+from hvnet.data.kitti import CLASSES
+from hvnet.model import load, load_checkpoint, save_checkpoint
+from hvnet.train import (
+    EpochOrder,
+    TrainingFrames,
+    choose_out,
+    collate,
+    keep_metrics,
+    learning_rate,
+    load_database,
+    main,
+    seeded,
+)
+
+DEMO = Path(__file__).resolve().parents[1] / "configs" / "demo.yaml"
+TINY = [
+    "encoder.point_range=[0, -6.4, -3, 25.6, 6.4, 2]",
+    "encoder.feature_channels=4",
+    "encoder.image_channels=8",
+    "backbone.widths=[8, 8, 8]",
+    "backbone.layers=[2, 2, 2]",
+    "backbone.fusion_channels=8",
+    "head.score_threshold=0.001",
+    "head.candidates=50",
+    "head.detections=5",
+    "train.epochs=2",
+    "train.batch_size=2",
+    "train.warmup_steps=3",
+    "train.decay_epochs=[1]",
+    "train.validate_every=1",
+    "train.pictures=1",
+]
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _own_settings() -> Iterator[None]:
+    """Training asks torch for determinism: the other tests get their own settings back."""
+    before = torch.is_deterministic_algorithms_warn_only_enabled(), torch.utils.deterministic.fill_uninitialized_memory
+    yield
+    torch.use_deterministic_algorithms(True, warn_only=before[0])
+    torch.utils.deterministic.fill_uninitialized_memory = before[1]
+
+
+def run(root: Path | None, out: Path, *changes: str, resume: bool = False, config: Path = DEMO) -> str:
+    """Trains; returns what was printed."""
+    arguments = ["--config", str(config), "--out", str(out), "--device", "cpu"]
+    arguments += ["--data", str(root)] if root is not None else []
+    arguments += ["--resume"] if resume else []
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        main(arguments + [part for change in (*TINY, *changes) for part in ("--set", change)])
+    return printed.getvalue()
+
+
+def metrics(out: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two checkpoints are equal, tensors bit for bit."""
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
+
+
+def numbers(printed: str) -> str:
+    """What was printed, without the paths."""
+    return "\n".join(line for line in printed.splitlines() if "run is" not in line and "/" not in line)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def trained(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Two epochs, and what they printed. Tests only read it."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    out = tmp_path_factory.mktemp("runs") / "tiny"
+    printed = run(scenes, out)
+    torch.set_num_threads(threads)
+    return out, printed
+
+
+@pytest.fixture
+def copied(scenes: Path, tmp_path: Path) -> Path:
+    """Scenes that a test may change."""
+    return Path(shutil.copytree(scenes, tmp_path / "kitti"))
+
+
+@pytest.fixture
+def tiny() -> Config:
+    return load_config(DEMO, TINY)
+
+
+# --- a run ------------------------------------------------------------------------------------------------------------
+
+
+def test_what_a_run_writes(trained: tuple[Path, str]) -> None:
+    out, printed = trained
+    assert {path.name for path in out.iterdir()} == {"checkpoint.pt", "metrics.jsonl", "tensorboard", "pictures"}
+    assert printed.startswith("4 frames to train, 2 to validate, on cpu")
+    for epoch, record in enumerate(metrics(out), 1):
+        assert (record["epoch"], record["step"]) == (epoch, 2 * epoch)
+        losses = [f"{name} {record[name]:.6f}" for name in
+                  ("loss", "classification", "localization", "vertical", "direction")]  # fmt: skip
+        assert f"epoch {epoch:3d}  " + "  ".join(losses) in printed
+        assert record["loss"] == pytest.approx(sum(record[name.split()[0]] for name in losses[1:]), rel=1e-6)
+        assert set(record["validation"]) == {"Car", "Pedestrian", "Cyclist"}
+        assert len(record["validation"]["Car"]["R40"]["bev"]) == 3
+        assert "exact" in record["validation"]["Car"]
+    assert printed.count("Car: ") == 2
+    assert str(out / "pictures") in printed
+    assert [path.name for path in (out / "pictures").iterdir()] == ["000004.png"]
+    with Image.open(out / "pictures" / "000004.png") as image:
+        assert image.format == "PNG"
+    assert load(out / "checkpoint.pt", "cpu").classes == ("Car", "Pedestrian", "Cyclist")
+
+
+def test_tensorboard_has_the_metrics(trained: tuple[Path, str]) -> None:
+    out, _ = trained
+    board = EventAccumulator(str(out / "tensorboard")).Reload()
+    written = board.Scalars("loss")
+    assert [event.step for event in written] == [1, 2]
+    assert [event.value for event in written] == pytest.approx([record["loss"] for record in metrics(out)])
+    assert "validation/Car/R40/bev/moderate" in board.Tags()["scalars"]
+
+
+def test_the_same_seed_gives_the_same_bits(scenes: Path, trained: tuple[Path, str], tmp_path: Path) -> None:
+    out, printed = trained
+    again = run(scenes, tmp_path / "again")
+    assert numbers(again) == numbers(printed)
+    assert (tmp_path / "again" / "metrics.jsonl").read_bytes() == (out / "metrics.jsonl").read_bytes()
+    assert same(load_checkpoint(tmp_path / "again" / "checkpoint.pt"), load_checkpoint(out / "checkpoint.pt"))
+    assert contents(tmp_path / "again" / "pictures") == contents(out / "pictures")
+
+
+def test_workers_change_no_bit_and_pass_errors_on(
+    copied: Path, trained: tuple[Path, str], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out, _ = trained
+    run(copied, tmp_path / "workers", "train.workers=2")
+    mine, theirs = load_checkpoint(out / "checkpoint.pt"), load_checkpoint(tmp_path / "workers" / "checkpoint.pt")
+    assert same(mine["model"], theirs["model"])
+    assert same(mine["optimizer"], theirs["optimizer"])
+    assert metrics(tmp_path / "workers") == metrics(out)
+
+    label = copied / "training" / "label_2" / "000001.txt"
+    label.write_text(label.read_text().replace("Car", "Boat", 1))
+    with pytest.raises(InputError, match=rf"^{re.escape(str(label))}:\d+: unknown class 'Boat'; known are [^\n]*$"):
+        run(copied, tmp_path / "boat", "train.workers=1")
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_another_seed_gives_another_run(scenes: Path, trained: tuple[Path, str], tmp_path: Path) -> None:
+    run(scenes, tmp_path / "other", "train.seed=1", "train.epochs=1")
+    assert metrics(tmp_path / "other")[0]["loss"] != metrics(trained[0])[0]["loss"]
+
+
+def test_bfloat16(scenes: Path, trained: tuple[Path, str], tmp_path: Path) -> None:
+    run(scenes, tmp_path / "half", "train.bfloat16=true", "train.epochs=1")
+    ours, full = metrics(tmp_path / "half")[0]["loss"], metrics(trained[0])[0]["loss"]
+    assert ours == pytest.approx(full, rel=0.1)  # bfloat16 has 8 bits: 0.4 % a number
+    assert ours != full
+    weights = load_checkpoint(tmp_path / "half" / "checkpoint.pt")["model"]
+    assert {value.dtype for value in weights.values()} == {torch.float32, torch.int64}
+
+
+def test_without_data_scenes_are_generated(tmp_path: Path) -> None:
+    changes = ["synthetic.train_frames=2", "synthetic.val_frames=1", "train.epochs=1"]
+    run(None, tmp_path / "a", *changes)
+    folder = tmp_path / "scenes-2-1-25.6m-0"
+    assert len(list((folder / "training" / "velodyne").iterdir())) == 3
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*.bin")}
+    run(None, tmp_path / "b", *changes)
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*.bin")} == before
+    assert metrics(tmp_path / "a") == metrics(tmp_path / "b")
+
+
+# --- resuming ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_resumed_run_is_the_run_in_one_go(scenes: Path, trained: tuple[Path, str], tmp_path: Path) -> None:
+    whole, printed = trained
+    out = tmp_path / "resumed"
+    run(scenes, out, "train.epochs=1")
+    with (out / "metrics.jsonl").open("a") as file:
+        file.write('{"epoch": 2, "lo')  # a run that was stopped while it wrote
+    second = run(scenes, out, resume=True)
+    assert (out / "metrics.jsonl").read_bytes() == (whole / "metrics.jsonl").read_bytes()
+    assert same(load_checkpoint(out / "checkpoint.pt"), load_checkpoint(whole / "checkpoint.pt"))
+    assert "epoch   1 " not in second
+    assert numbers(printed).endswith(numbers(second))
+    board = EventAccumulator(str(out / "tensorboard")).Reload()
+    assert [event.step for event in board.Scalars("loss")] == [1, 2]  # none is purged
+
+
+@pytest.fixture
+def begun(trained: tuple[Path, str], tmp_path: Path) -> Path:
+    """A copy of the run, to resume."""
+    return Path(shutil.copytree(trained[0], tmp_path / "begun"))
+
+
+def test_resuming_a_finished_run_changes_nothing(scenes: Path, begun: Path) -> None:
+    before = contents(begun)
+    run(scenes, begun, resume=True)
+    after = contents(begun)
+    assert {name: after[name] for name in before} == before
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ("backbone.layers=[2, 2, 3]", "backbone.layers"),
+        ("train.seed=1", "train.seed"),
+        ("head.direction=false", "head.direction"),
+        ("augment.objects.Car=3", "augment.objects.Car"),
+        ("synthetic=null", "synthetic"),
+    ],
+)
+def test_another_config_is_refused(scenes: Path, begun: Path, change: str, key: str) -> None:
+    before = contents(begun)
+    with pytest.raises(InputError, match=rf"checkpoint\.pt: was trained with another {re.escape(key)}"):
+        run(scenes, begun, change, resume=True)
+    assert contents(begun) == before
+
+
+def test_a_broken_checkpoint_is_refused(scenes: Path, begun: Path) -> None:
+    path = begun / "checkpoint.pt"
+    content = load_checkpoint(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"checkpoint\.pt: truncated"):
+        run(scenes, begun, resume=True)
+    for key in ("optimizer", "epoch", "random"):
+        save_checkpoint(path, {name: value for name, value in content.items() if name != key})
+        with pytest.raises(InputError, match=rf"checkpoint\.pt: does not hold a whole run \('{key}'\)"):
+            run(scenes, begun, resume=True)
+
+
+def test_metrics_keep_the_epochs_that_are_done(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    assert keep_metrics(path, 0) == path
+    assert not path.exists()
+    for rest in ("", '{"epoch": 3}\n', '{"epoch": 3, "a": {"b": 1}', "{"):
+        path.write_text('{"epoch": 1}\n{"epoch": 2}\n' + rest)
+        keep_metrics(path, 2)
+        assert path.read_text() == '{"epoch": 1}\n{"epoch": 2}\n'
+
+
+# --- mistakes ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_that_is_not_empty_is_refused(scenes: Path, tmp_path: Path) -> None:
+    out = tmp_path / "mine"
+    out.mkdir()
+    (out / "thesis.txt").write_text("years of work")
+    with pytest.raises(InputError, match=r"mine: is not empty; give another --out, or --resume"):
+        run(scenes, out)
+    with pytest.raises(InputError, match=r"mine: holds no checkpoint\.pt to resume"):
+        run(scenes, out, resume=True)
+    assert contents(out) == {"thesis.txt": b"years of work"}
+    with pytest.raises(InputError, match=r"thesis\.txt: is not empty"):
+        run(scenes, out / "thesis.txt")
+
+
+def test_nothing_to_resume(scenes: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none: holds no checkpoint\.pt to resume"):
+        run(scenes, tmp_path / "none", resume=True)
+    assert not (tmp_path / "none").exists()
+
+
+def _no_frame(root: Path) -> str:
+    (root / "ImageSets" / "val.txt").write_text("000004\n000099\n")
+    return r"val\.txt:2: frame 000099 has no .*000099\.bin; add the file or remove the line"
+
+
+def _unknown_class(root: Path) -> str:
+    (root / "training" / "label_2" / "000002.txt").write_text("Boat 0 0 0 0 0 9 9 1 1 1 0 0 9 0\n")
+    return r"000002\.txt:1: unknown class 'Boat'"
+
+
+def _no_split(root: Path) -> str:
+    (root / "ImageSets" / "train.txt").unlink()
+    return r"train\.txt: no such file; it holds the frames of split 'train'"
+
+
+def _cut_off_cloud(root: Path) -> str:
+    path = root / "training" / "velodyne" / "000003.bin"
+    path.write_bytes(path.read_bytes()[:-3])
+    return r"000003\.bin: \d+ bytes are no multiple of 16"
+
+
+def _no_calibration(root: Path) -> str:
+    (root / "training" / "calib" / "000003.txt").write_text("P2: 1 2 3\n")
+    return r"000003\.txt:1: P2 has 3 numbers, expected 12"
+
+
+@pytest.mark.parametrize("spoil", [_no_frame, _unknown_class, _no_split, _cut_off_cloud, _no_calibration])
+def test_mistakes_in_the_data(copied: Path, tmp_path: Path, spoil: Callable[[Path], str]) -> None:
+    (copied / "gt_database.npz").unlink(missing_ok=True)
+    message = spoil(copied)
+    with pytest.raises(InputError, match=message):
+        run(copied, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_mistakes_in_the_arguments(scenes: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"demo\.yaml: has no key synthetic, so it needs --data with a KITTI root"):
+        run(None, tmp_path / "out", "synthetic=null")
+    with pytest.raises(InputError, match=r"demo\.yaml: head\.classes\[0\]\.name: unknown class 'Boat'; known are Car"):
+        run(scenes, tmp_path / "out", "augment.objects={}", f"head.classes=[{_entry('Boat')}]")
+    with pytest.raises(InputError, match=r"train\.epoch: unknown key"):
+        run(scenes, tmp_path / "out", "train.epoch=3")
+    with pytest.raises(InputError, match=r"none\.txt: no such file"):
+        run(scenes, tmp_path / "out", "train.train_split=none")
+    assert list(tmp_path.iterdir()) == []
+
+
+def _entry(name: str) -> str:
+    return (
+        f"{{name: {name}, level: 0, anchor_sizes: [[4, 2, 2]], anchor_z: 0, positive_iou: 0.5, negative_iou: 0.3,"
+        " focal_alpha: 0.2, focal_gamma: 2, nms_iou: 0.1}"
+    )
+
+
+def test_a_diverging_run_keeps_its_last_checkpoint(scenes: Path, begun: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = contents(begun)
+    with pytest.raises(InputError, match=r"the loss is .* at step \d+; lower train\.learning_rate and --resume"):
+        run(scenes, begun, "train.learning_rate=1.0e+30", "train.epochs=9", resume=True)
+    assert load_checkpoint(begun / "checkpoint.pt")["epoch"] >= 2
+    for value in load_checkpoint(begun / "checkpoint.pt")["model"].values():
+        assert value.isfinite().all()
+    assert contents(begun).keys() >= before.keys()
+
+
+# --- odd frames -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("batch_size", [1, 2])
+def test_frames_without_objects_or_points(copied: Path, tmp_path: Path, batch_size: int) -> None:
+    """An empty label file, no point at all, and one point: alone, or with others in a batch."""
+    training = copied / "training"
+    (training / "label_2" / "000000.txt").write_text("")
+    (training / "velodyne" / "000001.bin").write_bytes(b"")
+    (training / "velodyne" / "000004.bin").write_bytes(b"")
+    one = torch.tensor([[20.0, 0.0, -1.0, 0.5]])
+    (training / "velodyne" / "000002.bin").write_bytes(one.numpy().tobytes())
+    run(copied, tmp_path / "out", f"train.batch_size={batch_size}")
+    for record in metrics(tmp_path / "out"):
+        assert math.isfinite(record["loss"])
+
+
+def test_no_object_in_any_frame(copied: Path, tmp_path: Path) -> None:
+    for path in (copied / "training" / "label_2").iterdir():
+        path.write_text("")
+    (copied / "gt_database.npz").unlink(missing_ok=True)
+    run(copied, tmp_path / "out", "augment.objects={}", "train.epochs=1")
+    record = metrics(tmp_path / "out")[0]
+    assert record["localization"] == 0
+    assert math.isfinite(record["loss"])
+    with pytest.raises(InputError, match="no object is labelled in the frames of split 'train'"):
+        run(copied, tmp_path / "other")
+
+
+# --- the parts --------------------------------------------------------------------------------------------------------
+
+
+def test_learning_rate() -> None:
+    config = TrainConfig(learning_rate=3.0, warmup_steps=10, warmup_ratio=1 / 3, decay_epochs=(4, 6), decay_ratio=0.1)
+    table = [(0, 0, 1.0), (5, 0, 2.0), (9, 0, 2.8), (10, 0, 3.0), (99, 3, 3.0), (100, 4, 0.3), (150, 5, 0.3),
+             (200, 6, 0.03), (999, 60, 0.03)]  # fmt: skip
+    for step, epoch, rate in table:
+        assert learning_rate(config, step, epoch) == pytest.approx(rate), (step, epoch)
+    assert learning_rate(dataclasses.replace(config, warmup_steps=0), 0, 0) == 3.0
+
+
+def test_an_item_depends_on_seed_epoch_and_number_alone(scenes: Path, tiny: Config) -> None:
+    ids = ["000000", "000001", "000002"]
+    database = load_database(scenes, tiny)
+
+    def frames(seed: int = 0) -> TrainingFrames:
+        return TrainingFrames(
+            scenes, ids, dataclasses.replace(tiny, train=dataclasses.replace(tiny.train, seed=seed)), database
+        )
+
+    one = frames()
+    first = {item: one[item] for item in ((0, 0), (0, 1), (1, 0), (7, 2))}
+    torch.rand(3)  # no state of torch's matters
+    other = frames()
+    for item in reversed(first):  # nor does the order
+        assert same(other[item], first[item])
+        assert same(one[item], first[item])
+    assert not same(first[0, 0], first[1, 0])
+    assert not same(first[0, 0], frames(seed=1)[0, 0])
+
+
+def test_order_of_an_epoch() -> None:
+    order = EpochOrder(50, seed=3)
+    first = list(order)
+    assert len(order) == 50
+    assert sorted(first) == [(0, k) for k in range(50)]
+    assert list(order) == first
+    order.epoch = 1
+    assert sorted(order) == [(1, k) for k in range(50)]
+    assert [k for _, k in order] != [k for _, k in first]
+    assert list(EpochOrder(50, seed=4)) != first
+
+
+def test_seeds_are_mixed() -> None:
+    seeds = {seeded(a, b, c).initial_seed() for a in range(8) for b in range(8) for c in range(8)}
+    assert len(seeds) == 512
+    assert seeded(1, 2).initial_seed() == seeded(1, 2).initial_seed()
+
+
+def test_boxes_outside_the_range_and_other_classes_are_dropped(copied: Path, tiny: Config) -> None:
+    still = dataclasses.replace(tiny.augment, flip=0, rotation=0, scaling=(1, 1), translation=(0, 0, 0), objects={})
+    config = dataclasses.replace(tiny, augment=still)
+    lines = [
+        "Car 0 0 0 600 150 700 200 1.5 1.6 4.0 0.00 1.7 10.0 0",  # ahead
+        "Car 0 0 0 600 150 700 200 1.5 1.6 4.0 0.00 1.7 40.0 0",  # too far
+        "Pedestrian 0 0 0 600 150 700 200 1.7 0.6 0.8 -7.5 1.7 9.0 0",  # too far to the left
+        "Cyclist 0 0 0 600 150 700 200 1.7 0.6 1.8 5.0 1.7 9.0 0",
+        "Van 0 0 0 600 150 700 200 2.0 1.9 5.0 -4.0 1.7 12.0 0",  # no class of the config
+        "DontCare -1 -1 -10 600 150 700 200 -1 -1 -1 -1000 -1000 -1000 -10",
+    ]
+    (copied / "training" / "label_2" / "000000.txt").write_text("\n".join(lines) + "\n")
+    _, boxes, labels = TrainingFrames(copied, ["000000"], config, None)[0, 0]
+    assert labels.tolist() == [0, 2]
+    # the camera stands 0.27 m before the LiDAR, and its axes are turned by less than a degree
+    torch.testing.assert_close(boxes[:, :2], torch.tensor([[10.3, 0.0], [9.3, -5.0]]), rtol=0, atol=0.2)
+
+
+def test_batches_hold_whole_frames(scenes: Path, tiny: Config) -> None:
+    items = [(0, 2), (0, 0), (0, 1)]
+    config = dataclasses.replace(tiny, augment=dataclasses.replace(tiny.augment, objects={}))
+    frames = TrainingFrames(scenes, ["000000", "000001", "000002"], config, None)
+    (batch,) = DataLoader(frames, batch_size=3, sampler=items, collate_fn=collate)  # type: ignore[arg-type]
+    for b, item in enumerate(items):
+        points, boxes, labels = frames[item]
+        assert torch.equal(batch.points[batch.sample == b], points)
+        assert torch.equal(batch.boxes[b], boxes)
+        assert torch.equal(batch.labels[b], labels)
+    assert (batch.sample.diff() >= 0).all()
+
+
+def test_folders_are_numbered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    config, first = Path("some/demo.yaml"), Path("runs/demo")
+    assert choose_out(None, config, resume=False) == first
+    with pytest.raises(InputError, match=r"demo: holds no checkpoint\.pt to resume"):
+        choose_out(None, config, resume=True)
+    first.mkdir(parents=True)
+    assert choose_out(None, config, resume=False) == Path("runs/demo-2")
+    Path("runs/demo-2").mkdir()
+    Path("runs/demo-2/checkpoint.pt").touch()
+    assert choose_out(None, config, resume=False) == Path("runs/demo-3")
+    assert choose_out(None, config, resume=True) == Path("runs/demo-2")
+    assert choose_out("runs/demo", config, resume=False) == first  # it is empty
+    assert choose_out("runs/demo-2", config, resume=True) == Path("runs/demo-2")
+    with pytest.raises(InputError, match=r"demo-2: is not empty"):
+        choose_out("runs/demo-2", config, resume=False)
+
+
+def test_the_shipped_classes_are_kittis(tiny: Config) -> None:
+    assert {entry.name for entry in tiny.head.classes} <= set(CLASSES)
