@@ -9,10 +9,10 @@ class InputError(ValueError):
 
 
 def run_command(main: Callable[[Sequence[str] | None], None]) -> None:
-    """Runs a command's main: an InputError ends it with one line and exit code 2, Ctrl-C with 130."""
+    """Runs a command's main: a user's mistake, or a file that fails, ends it with one line and exit code 2."""
     try:
         main(None)
-    except InputError as error:
+    except (InputError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:

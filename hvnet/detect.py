@@ -67,6 +67,8 @@ def find_sources(inputs: Sequence[Path], split: str | None) -> list[Source]:
             sources += [Source(file.stem, file, None) for file in files]
         else:
             raise InputError(f"{path}: no such file or folder")
+    if split is not None and all(source.split_dir is None for source in sources):
+        raise InputError(f"--split {split}: none of the inputs is a KITTI root")
     first: dict[str, Source] = {}
     for source in sources:
         if source.name in first:

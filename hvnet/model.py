@@ -119,10 +119,12 @@ def select_device(name: str) -> torch.device:
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name.startswith("cuda") and not torch.cuda.is_available():
         raise InputError(f"--device {name}: torch sees no CUDA device; use --device cpu")
+    if name.partition(":")[0] not in ("cpu", "cuda"):
+        raise InputError(f"--device {name}: want auto, cpu or cuda")
     try:
         return torch.device(name)
     except RuntimeError as error:
-        raise InputError(f"--device {name}: want auto, cpu or cuda") from error
+        raise InputError(f"--device {name}: want auto, cpu, cuda or cuda:N") from error
 
 
 class Detector:

@@ -27,6 +27,10 @@ from hvnet.model import HVNet, load_checkpoint, save_checkpoint, select_device
 DEMO = Path(__file__).resolve().parent.parent / "configs" / "demo.yaml"
 
 
+CHANGEABLE = [f"train.{key}" for key in ("epochs", "learning_rate", "validate_every", "pictures", "workers")]
+"""What may differ from the run that --resume takes up."""
+
+
 class Batch(NamedTuple):
     """Several frames in one: all points, the sample of each, and the boxes of every sample."""
 
@@ -189,6 +193,8 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
     out.mkdir(parents=True, exist_ok=True)
     metrics = keep_metrics(out / "metrics.jsonl", first_epoch)
     board = SummaryWriter(str(out / "tensorboard"), purge_step=first_epoch + 1)
+    if not resume:
+        save_run(out, model, optimizer, 0, 0)  # so that a run which fails in its first epoch can be resumed
     for epoch in range(first_epoch, config.train.epochs):
         order.epoch = epoch
         losses, step = train_epoch(model, optimizer, loader, epoch, step, device)
@@ -206,17 +212,9 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
         for name, value in flatten(record):
             board.add_scalar(name, value, epoch + 1)
         board.flush()
-        content = {
-            "config": config_to_dict(config),
-            "model": model.state_dict(),
-            "optimizer": optimizer.state_dict(),
-            "epoch": epoch + 1,
-            "step": step,
-            "random": torch.get_rng_state(),
-        }
         with metrics.open("a", encoding="utf-8") as file:
             file.write(json.dumps(record) + "\n")
-        save_checkpoint(out / "checkpoint.pt", content)
+        save_run(out, model, optimizer, epoch + 1, step)
     board.close()
     print(f"checkpoint: {out / 'checkpoint.pt'}\npictures:   {out / 'pictures'}")
 
@@ -243,12 +241,25 @@ def make_deterministic(seed: int) -> None:
     torch.backends.cudnn.benchmark = False
 
 
+def save_run(out: Path, model: HVNet, optimizer: torch.optim.Optimizer, epochs: int, steps: int) -> None:
+    """Writes checkpoint.pt: all that a run needs to go on after so many epochs and steps."""
+    content = {
+        "config": config_to_dict(model.config),
+        "model": model.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "epoch": epochs,
+        "step": steps,
+        "random": torch.get_rng_state(),
+    }
+    save_checkpoint(out / "checkpoint.pt", content)
+
+
 def restore(path: Path, model: HVNet, optimizer: torch.optim.Optimizer) -> tuple[int, int]:
     """Takes up a run where its checkpoint left it; returns the epochs and steps done."""
     content = load_checkpoint(path)
     here = config_to_dict(model.config)
     changed = sorted(key for key, _ in set(_leaves(content["config"])) ^ set(_leaves(here)))
-    changed = [key for key in changed if key not in ("train.epochs", "train.learning_rate")]
+    changed = [key for key in changed if key not in CHANGEABLE]
     if changed:
         raise InputError(f"{path}: was trained with another {changed[0]}; give its config, or another --out")
     try:
@@ -335,7 +346,13 @@ def main(arguments: Sequence[str] | None) -> None:
             raise InputError(f"{options.config}: has no key synthetic, so it needs --data with a KITTI root")
         scenes, reach = config.synthetic, config.encoder.point_range[3]
         root = out.parent / f"scenes-{scenes.train_frames}-{scenes.val_frames}-{reach:g}m-{config.train.seed}"
-        generate(root, scenes.train_frames, scenes.val_frames, config.train.seed, Options(distance=(4.0, reach - 2)))
+        generate(
+            root,
+            scenes.train_frames,
+            scenes.val_frames,
+            config.train.seed,
+            Options(distance=(4.0, min(reach - 2, 80.0))),
+        )
     train(config, root, out, device, options.resume)
 
 

@@ -45,7 +45,7 @@ class VoxelIndex(NamedTuple):
 class NestedIndex(NamedTuple):
     """The voxels of S nested scales in arrays of fixed size, so that no length has to be read from the device.
 
-    Of N points the first `kept` in the new order are inside every grid; scale s has `count[s]` voxels. What lies beyond
+    Of N points the first `kept` in the new order are inside every grid; scale s has `counts[s]` voxels. What lies beyond
     is not set.
     """
 
@@ -53,7 +53,7 @@ class NestedIndex(NamedTuple):
     voxel: Tensor  # (S, N) int64, the voxel of each point in the new order
     starts: Tensor  # (S, N + 1) int64
     cursor: Tensor  # (S, N) int64
-    count: Tensor  # (S + 1,) int64: voxels of every scale, then the points kept
+    counts: Tensor  # (S + 1,) int64: voxels of every scale, then the points kept
 
 
 def make_grid(point_range: Sequence[float], voxel_size: Sequence[float], scale: float, multiple: int = 1) -> Grid:
@@ -113,7 +113,7 @@ def voxel_index(points: Tensor, sample: Tensor, batch_size: int, grids: Sequence
             raise ValueError(f"grids: {batch_size} samples of {grid.shape} cells have cursors beyond int64")
     if is_nested(grids, batch_size):
         nested = nested_index(points, sample, grids)
-        *counts, kept = nested.count.tolist()
+        *counts, kept = nested.counts.tolist()
         scales = [
             Voxels(nested.cursor[s, :v], Segments(nested.voxel[s, :kept], nested.starts[s, : v + 1], None))
             for s, v in enumerate(counts)

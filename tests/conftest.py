@@ -1,7 +1,6 @@
 """Fixtures for all tests: unwritten memory is seen, the real KITTI frames are found or skipped."""
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,6 +10,7 @@ from hvnet.data.synthetic import Options, generate
 
 torch.utils.deterministic.fill_uninitialized_memory = True
 torch.use_deterministic_algorithms(True)  # with it, torch.empty is filled with NaN or the largest integer
+torch.set_num_threads(1)  # the networks here are small: threads cost more than they save where others use the cores
 
 SHARED = Path(os.environ.get("HVNET_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 
@@ -28,15 +28,6 @@ def device(request: pytest.FixtureRequest) -> torch.device:
     if request.param == "cuda" and not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     return torch.device(request.param)
-
-
-@pytest.fixture
-def one_thread() -> Iterator[None]:
-    """For networks so small that threads cost more than they save: tenfold on a machine that others use as well."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="session")

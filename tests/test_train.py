@@ -52,8 +52,6 @@ TINY = [
     "train.pictures=1",
 ]
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 @pytest.fixture(autouse=True, scope="module")
 def _own_settings() -> Iterator[None]:

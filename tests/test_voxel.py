@@ -322,7 +322,9 @@ def test_same_bits_on_every_run(scales: tuple[float, ...], device: torch.device)
         index = voxel.voxel_index(points.to(device), sample.to(device), 2, grids)
         parts = [index.order]
         for voxels in index.scales:
-            parts += [voxels.cursor, voxels.segments.voxel, voxels.segments.starts] + ([] if voxels.segments.order is None else [voxels.segments.order])
+            parts += [voxels.cursor, voxels.segments.voxel, voxels.segments.starts] + (
+                [] if voxels.segments.order is None else [voxels.segments.order]
+            )
         return [part.cpu() for part in parts]
 
     for first, second, on_cpu in zip(results(device), results(device), results(torch.device("cpu")), strict=True):
