@@ -64,7 +64,8 @@ def gather(src: Tensor, index: Tensor) -> Tensor:
 
 def segment_max(src: Tensor, voxels: Segments) -> tuple[Tensor, Tensor]:
     """`scatter_max` over segments that are at hand: src (N, C) gives values and arg-max (V, C)."""
-    return _segment_max(src, voxels.voxel, voxels.order, voxels.starts)
+    values, argmax = _segment_max(src, voxels.voxel, voxels.order, voxels.starts)
+    return values, argmax.long()
 
 
 def segment_mean(src: Tensor, voxels: Segments) -> Tensor:
@@ -91,7 +92,7 @@ def _checked_segments(src: Tensor, index: Tensor, dim_size: int) -> Segments:
 def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
     """The kernels for one floating type and vector length, in a module of their own."""
     vec = wp.types.vector(length=lanes, dtype=dtype)
-    ivec = wp.types.vector(length=lanes, dtype=wp.int64)
+    places = wp.types.vector(length=lanes, dtype=wp.int32)  # as wide as float32: the lanes stay in step
     sums = wp.types.vector(length=lanes, dtype=wp.float64)
     module = wp.Module(f"hvnet_scatter_{dtype.__name__}_{lanes}", None)
 
@@ -108,32 +109,61 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         order: wp.array(dtype=wp.int64),
         starts: wp.array(dtype=wp.int64),
         values: wp.array2d(dtype=vec),
-        argmax: wp.array2d(dtype=ivec),
+        argmax: wp.array2d(dtype=places),
     ):
         voxel, c = wp.tid()
         start = int(starts[voxel])
         end = int(starts[voxel + 1])
         best = vec()
-        at = ivec(wp.int64(src.shape[0]))
+        at = places(src.shape[0])
         if start < end:
             i = point_at(order, start)
             best = src[i, c]
-            at = ivec(wp.int64(i))
+            at = places(i)
+        odd = best - best  # stays 0 unless a value is not finite
         for k in range(start + 1, end):
             i = point_at(order, k)
             row = src[i, c]
+            odd += row - row
             for lane in range(lanes):
-                # negated, so that a NaN wins; a later point wins a tie, unless the best is a NaN and it is not
+                if row[lane] >= best[lane]:
+                    best[lane] = row[lane]
+                    at[lane] = i
+        if wp.dot(odd, odd) != dtype(0.0):
+            at = places(-1)  # left to maximum_with_nan: its branches would slow down this loop fourfold
+        values[voxel, c] = best
+        argmax[voxel, c] = at
+
+    @wp.kernel(enable_backward=False, module=module)
+    def maximum_with_nan(
+        src: wp.array2d(dtype=vec),
+        order: wp.array(dtype=wp.int64),
+        starts: wp.array(dtype=wp.int64),
+        values: wp.array2d(dtype=vec),
+        argmax: wp.array2d(dtype=places),
+    ):
+        voxel, c = wp.tid()
+        if argmax[voxel, c][0] >= 0:
+            return
+        start = int(starts[voxel])
+        i = point_at(order, start)
+        best = src[i, c]
+        at = places(i)
+        for k in range(start + 1, int(starts[voxel + 1])):
+            i = point_at(order, k)
+            row = src[i, c]
+            for lane in range(lanes):
+                # a later point wins unless it is below, or the best is a NaN and it is not
                 if not (row[lane] < best[lane]) and (row[lane] != row[lane] or best[lane] == best[lane]):
                     best[lane] = row[lane]
-                    at[lane] = wp.int64(i)
+                    at[lane] = i
         values[voxel, c] = best
         argmax[voxel, c] = at
 
     @wp.kernel(enable_backward=False, module=module)
     def maximum_backward(
         grad: wp.array2d(dtype=vec),
-        argmax: wp.array2d(dtype=ivec),
+        argmax: wp.array2d(dtype=places),
         index: wp.array(dtype=wp.int64),
         grad_src: wp.array2d(dtype=vec),
     ):
@@ -143,7 +173,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         at = argmax[voxel, c]
         taken = vec()
         for lane in range(lanes):
-            if at[lane] == wp.int64(i):
+            if at[lane] == i:
                 taken[lane] = given[lane]
         grad_src[i, c] = taken
 
@@ -166,7 +196,9 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
             rounded[lane] = dtype(value[lane])
         values[voxel, c] = rounded
 
-    return SimpleNamespace(maximum=maximum, maximum_backward=maximum_backward, total=total)
+    return SimpleNamespace(
+        maximum=maximum, maximum_with_nan=maximum_with_nan, maximum_backward=maximum_backward, total=total
+    )
 
 
 def _order_array(order: Tensor | None, like: Tensor) -> Any:
@@ -177,17 +209,19 @@ def _order_array(order: Tensor | None, like: Tensor) -> Any:
 def _segment_max(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> tuple[Tensor, Tensor]:
     count, lanes = src.shape[1], lanes_of(src.shape[1])
     values = src.new_empty(len(starts) - 1, count)
-    argmax = torch.empty(len(starts) - 1, count, dtype=torch.int64, device=src.device)
+    argmax = torch.empty(len(starts) - 1, count, dtype=torch.int32, device=src.device)
     inputs = [channels(src.contiguous(), lanes), _order_array(order, starts), array(starts)]
     inputs += [channels(values, lanes), channels(argmax, lanes)]
-    launch(_kernels(WARP_FLOAT[src.dtype], lanes).maximum, (len(values), count // lanes), inputs, src.device)
+    kernels = _kernels(WARP_FLOAT[src.dtype], lanes)
+    launch(kernels.maximum, (len(values), count // lanes), inputs, src.device)
+    launch(kernels.maximum_with_nan, (len(values), count // lanes), inputs, src.device)
     return values, argmax
 
 
 @_segment_max.register_fake
 def _(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> tuple[Tensor, Tensor]:
     values = src.new_empty(len(starts) - 1, src.shape[1])
-    return values, torch.empty_like(values, dtype=torch.int64)
+    return values, torch.empty_like(values, dtype=torch.int32)
 
 
 @torch.library.custom_op("hvnet::segment_max_backward", mutates_args=())

@@ -1,13 +1,15 @@
 """The encoder against the paper's equations, written out plainly in float64 with the twins."""
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
 from hvnet.config import EncoderConfig
-from hvnet.encoder import AttentiveVFE, HybridVoxelEncoder, projection_grids
+from hvnet.data.kitti import read_frame
+from hvnet.encoder import AttentiveVFE, FusedEncoder, HybridVoxelEncoder, projection_grids
 from hvnet.kernels import reference
 from hvnet.kernels.voxel import Grid
 
@@ -177,3 +179,71 @@ def test_projection_grids_are_padded_and_halved() -> None:
     assert [grid.cells for grid in grids] == [(214, 214), (107, 107), (54, 54)]
     assert [grid.shape for grid in grids] == [(216, 216), (108, 108), (54, 54)]
     assert isinstance(grids[0], Grid)
+
+
+def trained(config: EncoderConfig) -> HybridVoxelEncoder:
+    """An encoder whose statistics and weights are not those of the start, in evaluation mode."""
+    torch.manual_seed(5)
+    encoder = HybridVoxelEncoder(config)
+    for module in encoder.modules():
+        if isinstance(module, torch.nn.BatchNorm1d):
+            module.running_mean.normal_()
+            module.running_var.uniform_(0.5, 2)
+            torch.nn.init.normal_(module.weight)
+            torch.nn.init.normal_(module.bias)
+    return encoder.eval()
+
+
+@pytest.mark.parametrize(("feature_scales", "projection_scales"), SCALES)
+@pytest.mark.parametrize("relu", [True, False])
+def test_fused_encoder_gives_the_same_images(
+    feature_scales: tuple[float, ...], projection_scales: tuple[float, ...], relu: bool
+) -> None:
+    config = dataclasses.replace(
+        SMALL, feature_scales=feature_scales, projection_scales=projection_scales, attention_relu=relu
+    )
+    encoder = trained(config)
+    fused = FusedEncoder(encoder)
+    # the second cloud must find no trace of the first, an empty one and one point leave nothing else
+    for points, sample in (cloud(400), cloud(100, seed=1), cloud(0), cloud(1, seed=4), cloud(400)):
+        with torch.no_grad():
+            expected = encoder(points, sample, 2)
+        for image, plain in zip(fused(points, sample, 2), expected, strict=True):
+            assert image.is_contiguous(memory_format=torch.channels_last)
+            torch.testing.assert_close(image, plain, rtol=1e-4, atol=1e-4)  # products of two sums in float32
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_fused_encoder_in_half_precision(dtype: torch.dtype) -> None:
+    encoder = trained(SMALL)
+    points, sample = cloud(300)
+    with torch.no_grad():
+        expected = encoder(points, sample, 2)
+    for image, plain in zip(FusedEncoder(encoder)(points, sample, 2, dtype), expected, strict=True):
+        assert image.dtype == dtype
+        tolerance = torch.finfo(dtype).eps  # one rounding of the last step
+        torch.testing.assert_close(image.float(), plain, rtol=2 * tolerance, atol=tolerance)
+
+
+def test_fused_encoder_follows_the_weights() -> None:
+    encoder = trained(SMALL)
+    fused = FusedEncoder(encoder)
+    points, sample = cloud(300)
+    before = [image.clone() for image in fused(points, sample, 2)]
+    with torch.no_grad():
+        encoder.avfeo.features_norm.weight.mul_(2)
+        encoder.avfeo.features_norm.bias.mul_(2)
+    for image, old in zip(fused(points, sample, 2), before, strict=True):
+        torch.testing.assert_close(image, 2 * old)
+
+
+def test_fused_encoder_on_a_real_frame(kitti_root: Path) -> None:
+    encoder = trained(EncoderConfig())
+    points = read_frame(kitti_root, "000008").points
+    sample = torch.zeros(len(points), dtype=torch.int64)
+    with torch.no_grad():
+        expected = encoder(points, sample, 1)
+    for image, plain in zip(FusedEncoder(encoder)(points, sample, 1), expected, strict=True):
+        # coordinates up to 64 m go through sums that cancel: relative to the image's largest value
+        assert (image - plain).abs().max() <= 2e-6 * plain.abs().max()
+        assert torch.equal(image != 0, plain != 0)

@@ -1,0 +1,474 @@
+"""Attentive voxel feature encoding in one kernel (Sec. 3.2): knowledge, its Linear, the product and the maximum.
+
+For a point in its voxel, attention a = W g + b with g = (x - mean x, f, mean p) of Eq. 2, product M = features * a, and
+G' = the maximum of M over the voxel. Neither g nor a is ever written: both are made again from the point and the mean
+of its voxel wherever they are needed, and so is the rest in the backward pass. Batch norms are folded into W and b.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from hvnet.kernels.launch import FLOATS, WARP_FLOAT, array, channels, check_tensor, lanes_of, launch
+from hvnet.kernels.scatter import Segments
+from hvnet.kernels.voxel import NestedIndex
+
+KNOWLEDGE = 9  # rows of a weight: x - mean x (3), f, mean p (4), and the bias
+
+
+def attend(
+    features: Tensor, points: Tensor, mean: Tensor, weight: Tensor, voxels: Segments, relu: bool = False
+) -> tuple[Tensor, Tensor]:
+    """M (N, C) and its maxima G' (V, C) for features (N, C) of points (N, 4) in voxels of means (V, 4).
+
+    The weight (9, C) holds the transposed W of g and, last, the bias b. With relu, features and attention go through a
+    ReLU before the product. A tie goes to the last point of the segment. Gradients to features and weight; the points
+    are given. Raises TypeError or ValueError naming the argument.
+    """
+    check_tensor("features", features, FLOATS, (None, None))
+    count = features.shape[1]
+    check_tensor("points", points, (features.dtype,), (len(features), 4), like=features)
+    check_tensor("mean", mean, (features.dtype,), (len(voxels.starts) - 1, 4), like=features)
+    check_tensor("weight", weight, (features.dtype,), (KNOWLEDGE, count), like=features)
+    product, values, _ = _attend(features, points, mean, weight, voxels.voxel, voxels.order, voxels.starts, relu)
+    return product, values
+
+
+class Scale(NamedTuple):
+    """The voxels of one scale in arrays of fixed size, for inference."""
+
+    voxel: Tensor  # (N,) int64, the voxel of each point
+    starts: Tensor  # int64, where each voxel's points start
+    cursor: Tensor  # int64, cursor of each voxel
+    count: Tensor  # (1,) int64, number of voxels, on the device
+    rows: int  # as many voxels or more, known on the host
+
+
+def scales_of(index: NestedIndex) -> tuple[list[Scale], Tensor, int]:
+    """The scales of an index, the number of points kept on the device (1,), and a bound of it on the host.
+
+    On a CPU the counts are at hand and bound the work; on a GPU the number of points does, and nothing is read.
+    """
+    scales, capacity = len(index.counts) - 1, len(index.order)
+    *rows, kept = index.counts.tolist() if index.counts.device.type == "cpu" else [capacity] * (scales + 1)
+    parts = [
+        Scale(index.voxel[s], index.starts[s], index.cursor[s], index.counts[s : s + 1], rows[s]) for s in range(scales)
+    ]
+    return parts, index.counts[scales:], kept
+
+
+def voxel_means(points: Tensor, scale: Scale) -> Tensor:
+    """Means (rows, 4) of the points (N, 4) float32 of each voxel."""
+    mean = points.new_empty(scale.rows, 4)
+    inputs = [array(points, 4), array(scale.starts), array(scale.count), array(mean, 4)]
+    launch(_means, scale.rows, inputs, points.device)
+    return mean
+
+
+def encode_voxels(
+    features: Tensor, points: Tensor, mean: Tensor, weight: Tensor, scale: Scale, relu: bool, product: Tensor, part: int
+) -> Tensor:
+    """`attend` without gradients: writes M to the part-th C columns of product (N, T C), returns G' (rows, C)."""
+    count = features.shape[1]
+    lanes = lanes_of(count)
+    values = features.new_empty(scale.rows, count)
+    inputs = [channels(features, lanes), array(points, 4), array(mean, 4), channels(weight, lanes)]
+    inputs += [array(scale.starts), array(scale.count), int(relu), part * count // lanes]
+    inputs += [channels(product, lanes), channels(values, lanes)]
+    launch(_kernels(wp.float32, lanes).encode, (scale.rows, count // lanes), inputs, features.device)
+    return values
+
+
+def add_of_voxels(features: Tensor, of_voxels: Tensor, voxel: Tensor, kept: Tensor) -> None:
+    """Adds to the features (N, C) of each point the rows of_voxels[t, voxel[t]] (T, V, C) of the voxels it lies in."""
+    scales, rows, count = of_voxels.shape
+    lanes = lanes_of(count)
+    wide = array(of_voxels.view(scales, rows, count // lanes, lanes), lanes)
+    inputs = [wide, array(voxel), array(kept), channels(features, lanes)]
+    launch(_context_kernel(lanes), (len(features), count // lanes), inputs, features.device)
+
+
+def project_voxels(
+    features: Tensor, points: Tensor, mean: Tensor, weight: Tensor, scale: Scale, relu: bool, image: Tensor
+) -> None:
+    """`attend` and Eq. 3 without gradients: writes G' to the cells of the image (B N_L N_W, C), float of any width."""
+    count = features.shape[1]
+    lanes = lanes_of(count)
+    inputs = [channels(features, lanes), array(points, 4), array(mean, 4), channels(weight, lanes)]
+    inputs += [array(scale.starts), array(scale.count), array(scale.cursor), int(relu), channels(image, lanes)]
+    kernel = _project_kernel(lanes, wp.dtype_from_torch(image.dtype))
+    launch(kernel, (scale.rows, count // lanes), inputs, features.device)
+
+
+def clear_voxels(image: Tensor, scale: Scale) -> None:
+    """Sets the cells of these voxels of an image (B N_L N_W, C) to zero."""
+    count = image.shape[1]
+    lanes = lanes_of(count)
+    kernel = _clear_kernel(lanes, wp.dtype_from_torch(image.dtype))
+    inputs = [array(scale.cursor), array(scale.count), channels(image, lanes)]
+    launch(kernel, (scale.rows, count // lanes), inputs, image.device)
+
+
+@functools.cache
+def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
+    """The kernels for one floating type and vector length, in a module of their own."""
+    vec = wp.types.vector(length=lanes, dtype=dtype)
+    point = wp.types.vector(length=4, dtype=dtype)
+    places = wp.types.vector(length=lanes, dtype=wp.int32)
+    module = wp.Module(f"hvnet_encode_{dtype.__name__}_{lanes}", None)
+    zero = dtype(0.0)
+
+    @wp.func
+    def of_voxel(weight: wp.array2d(dtype=vec), c: int, mean: point):
+        """The part of the attention that all points of a voxel share."""
+        shared = weight[8, c] + mean[0] * weight[4, c] + mean[1] * weight[5, c]
+        return shared + mean[2] * weight[6, c] + mean[3] * weight[7, c]
+
+    @wp.func
+    def of_point(w0: vec, w1: vec, w2: vec, w3: vec, p: point, mean: point):
+        return (p[0] - mean[0]) * w0 + (p[1] - mean[1]) * w1 + (p[2] - mean[2]) * w2 + p[3] * w3
+
+    @wp.func
+    def point_at(order: wp.array(dtype=wp.int64), k: int):
+        i = k
+        if order.shape[0] > 0:
+            i = int(order[k])
+        return i
+
+    @wp.kernel(enable_backward=False, module=module)
+    def forward(
+        features: wp.array2d(dtype=vec),
+        points: wp.array(dtype=point),
+        mean: wp.array(dtype=point),
+        weight: wp.array2d(dtype=vec),
+        order: wp.array(dtype=wp.int64),
+        starts: wp.array(dtype=wp.int64),
+        relu: int,
+        product: wp.array2d(dtype=vec),
+        values: wp.array2d(dtype=vec),
+        argmax: wp.array2d(dtype=places),
+    ):
+        voxel, c = wp.tid()
+        centre = mean[voxel]
+        shared = of_voxel(weight, c, centre)
+        w0, w1, w2, w3 = weight[0, c], weight[1, c], weight[2, c], weight[3, c]
+        best = vec()
+        at = places(-1)
+        start = int(starts[voxel])
+        for k in range(start, int(starts[voxel + 1])):
+            i = point_at(order, k)
+            attention = shared + of_point(w0, w1, w2, w3, points[i], centre)
+            row = features[i, c]
+            if relu != 0:
+                attention = wp.max(attention, vec())
+                row = wp.max(row, vec())
+            row = wp.cw_mul(row, attention)
+            product[i, c] = row
+            if k == start:
+                best = row
+                at = places(i)
+            for lane in range(lanes):
+                if row[lane] >= best[lane]:
+                    best[lane] = row[lane]
+                    at[lane] = i
+        values[voxel, c] = best
+        argmax[voxel, c] = at
+
+    @wp.kernel(enable_backward=False, module=module)
+    def backward(
+        grad_product: wp.array2d(dtype=vec),
+        grad_values: wp.array2d(dtype=vec),
+        features: wp.array2d(dtype=vec),
+        points: wp.array(dtype=point),
+        mean: wp.array(dtype=point),
+        weight: wp.array2d(dtype=vec),
+        voxels: wp.array(dtype=wp.int64),
+        argmax: wp.array2d(dtype=places),
+        relu: int,
+        grad_features: wp.array2d(dtype=vec),
+        grad_attention: wp.array2d(dtype=vec),
+    ):
+        i, c = wp.tid()
+        voxel = int(voxels[i])
+        given = grad_values[voxel, c]
+        at = argmax[voxel, c]
+        taken = vec()
+        for lane in range(lanes):
+            if at[lane] == i:
+                taken[lane] = given[lane]
+        if grad_product.shape[0] > 0:
+            taken += grad_product[i, c]
+        centre = mean[voxel]
+        attention = of_voxel(weight, c, centre) + of_point(
+            weight[0, c], weight[1, c], weight[2, c], weight[3, c], points[i], centre
+        )
+        row = features[i, c]
+        to_features = taken
+        to_attention = taken
+        if relu != 0:
+            for lane in range(lanes):
+                if not (row[lane] > zero):
+                    to_features[lane] = zero
+                if not (attention[lane] > zero):
+                    to_attention[lane] = zero
+            row = wp.max(row, vec())
+            attention = wp.max(attention, vec())
+        grad_features[i, c] = wp.cw_mul(to_features, attention)
+        grad_attention[i, c] = wp.cw_mul(to_attention, row)
+
+    @wp.kernel(enable_backward=False, module=module)
+    def encode(
+        features: wp.array2d(dtype=vec),
+        points: wp.array(dtype=point),
+        mean: wp.array(dtype=point),
+        weight: wp.array2d(dtype=vec),
+        starts: wp.array(dtype=wp.int64),
+        counts: wp.array(dtype=wp.int64),
+        relu: int,
+        column: int,
+        product: wp.array2d(dtype=vec),
+        values: wp.array2d(dtype=vec),
+    ):
+        """`forward` for inference: M goes into columns of H, no arg-max; voxels beyond the count are left out."""
+        voxel, c = wp.tid()
+        if wp.int64(voxel) >= counts[0]:
+            return
+        centre = mean[voxel]
+        shared = of_voxel(weight, c, centre)
+        w0, w1, w2, w3 = weight[0, c], weight[1, c], weight[2, c], weight[3, c]
+        start = int(starts[voxel])
+        best = vec()
+        for i in range(start, int(starts[voxel + 1])):
+            attention = shared + of_point(w0, w1, w2, w3, points[i], centre)
+            row = features[i, c]
+            if relu != 0:
+                attention = wp.max(attention, vec())
+                row = wp.max(row, vec())
+            row = wp.cw_mul(row, attention)
+            product[i, column + c] = row
+            if i == start:
+                best = row
+            best = wp.max(best, row)
+        values[voxel, c] = best
+
+    return SimpleNamespace(forward=forward, backward=backward, encode=encode, of_voxel=of_voxel, of_point=of_point)
+
+
+@functools.cache
+def _project_kernel(lanes: int, image_dtype: Any) -> wp.Kernel:
+    """The kernel from features to a pseudo-image of one floating type."""
+    vec = wp.types.vector(length=lanes, dtype=wp.float32)
+    pixel = wp.types.vector(length=lanes, dtype=image_dtype)
+    kernels = _kernels(wp.float32, lanes)
+    of_voxel, of_point = kernels.of_voxel, kernels.of_point
+
+    @wp.kernel(enable_backward=False, module=wp.Module(f"hvnet_project_{image_dtype.__name__}_{lanes}", None))
+    def project(
+        features: wp.array2d(dtype=vec),
+        points: wp.array(dtype=wp.vec4),
+        mean: wp.array(dtype=wp.vec4),
+        weight: wp.array2d(dtype=vec),
+        starts: wp.array(dtype=wp.int64),
+        counts: wp.array(dtype=wp.int64),
+        cursor: wp.array(dtype=wp.int64),
+        relu: int,
+        image: wp.array2d(dtype=pixel),
+    ):
+        voxel, c = wp.tid()
+        if wp.int64(voxel) >= counts[0]:
+            return
+        centre = mean[voxel]
+        shared = of_voxel(weight, c, centre)
+        w0, w1, w2, w3 = weight[0, c], weight[1, c], weight[2, c], weight[3, c]
+        start = int(starts[voxel])
+        best = vec()
+        for i in range(start, int(starts[voxel + 1])):
+            attention = shared + of_point(w0, w1, w2, w3, points[i], centre)
+            row = features[i, c]
+            if relu != 0:
+                attention = wp.max(attention, vec())
+                row = wp.max(row, vec())
+            row = wp.cw_mul(row, attention)
+            if i == start:
+                best = row
+            best = wp.max(best, row)
+        rounded = pixel()
+        for lane in range(lanes):
+            rounded[lane] = image_dtype(best[lane])
+        image[int(cursor[voxel]), c] = rounded
+
+    return project
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _means(
+    points: wp.array(dtype=wp.vec4),
+    starts: wp.array(dtype=wp.int64),
+    counts: wp.array(dtype=wp.int64),
+    mean: wp.array(dtype=wp.vec4),
+):
+    voxel = wp.tid()
+    if wp.int64(voxel) >= counts[0]:
+        return
+    start, end = int(starts[voxel]), int(starts[voxel + 1])
+    total = wp.vec4d()
+    for i in range(start, end):
+        total += wp.vec4d(points[i])
+    # rounded to float32 before the division, as segment_mean does
+    mean[voxel] = wp.vec4(total) / float(end - start)
+
+
+@functools.cache
+def _context_kernel(lanes: int) -> wp.Kernel:
+    vec = wp.types.vector(length=lanes, dtype=wp.float32)
+
+    @wp.kernel(enable_backward=False, module=wp.Module(f"hvnet_context_{lanes}", None))
+    def context(
+        of_voxels: wp.array3d(dtype=vec),
+        voxel: wp.array2d(dtype=wp.int64),
+        kept: wp.array(dtype=wp.int64),
+        features: wp.array2d(dtype=vec),
+    ):
+        """Adds to the features of each point what the voxels that it lies in give, scale after scale."""
+        i, c = wp.tid()
+        if wp.int64(i) >= kept[0]:
+            return
+        total = features[i, c]
+        for s in range(of_voxels.shape[0]):
+            total += of_voxels[s, int(voxel[s, i]), c]
+        features[i, c] = total
+
+    return context
+
+
+@functools.cache
+def _clear_kernel(lanes: int, image_dtype: Any) -> wp.Kernel:
+    pixel = wp.types.vector(length=lanes, dtype=image_dtype)
+
+    @wp.kernel(enable_backward=False, module=wp.Module(f"hvnet_clear_{image_dtype.__name__}_{lanes}", None))
+    def clear(cursor: wp.array(dtype=wp.int64), counts: wp.array(dtype=wp.int64), image: wp.array2d(dtype=pixel)):
+        voxel, c = wp.tid()
+        if wp.int64(voxel) < counts[0]:
+            image[int(cursor[voxel]), c] = pixel()
+
+    return clear
+
+
+@torch.library.custom_op("hvnet::attend", mutates_args=())
+def _attend(
+    features: Tensor,
+    points: Tensor,
+    mean: Tensor,
+    weight: Tensor,
+    voxel: Tensor,
+    order: Tensor | None,
+    starts: Tensor,
+    relu: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    count, lanes = features.shape[1], lanes_of(features.shape[1])
+    product = features.new_empty(features.shape)
+    values = features.new_empty(len(mean), count)
+    argmax = torch.empty(len(mean), count, dtype=torch.int32, device=features.device)
+    inputs = [
+        channels(features.contiguous(), lanes),
+        array(points.contiguous(), 4),
+        array(mean.contiguous(), 4),
+        channels(weight.contiguous(), lanes),
+        array(starts.new_empty(0) if order is None else order.contiguous()),
+        array(starts.contiguous()),
+        int(relu),
+        *(channels(output, lanes) for output in (product, values, argmax)),
+    ]
+    kernel = _kernels(WARP_FLOAT[features.dtype], lanes).forward
+    launch(kernel, (len(mean), count // lanes), inputs, features.device)
+    return product, values, argmax
+
+
+@_attend.register_fake
+def _(
+    features: Tensor,
+    points: Tensor,
+    mean: Tensor,
+    weight: Tensor,
+    voxel: Tensor,
+    order: Tensor | None,
+    starts: Tensor,
+    relu: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    values = features.new_empty(len(mean), features.shape[1])
+    return features.new_empty(features.shape), values, torch.empty_like(values, dtype=torch.int32)
+
+
+@torch.library.custom_op("hvnet::attend_backward", mutates_args=())
+def _attend_backward(
+    grad_product: Tensor | None,
+    grad_values: Tensor,
+    features: Tensor,
+    points: Tensor,
+    mean: Tensor,
+    weight: Tensor,
+    voxel: Tensor,
+    argmax: Tensor,
+    relu: bool,
+) -> tuple[Tensor, Tensor]:
+    count, lanes = features.shape[1], lanes_of(features.shape[1])
+    grads = features.new_empty(features.shape), features.new_empty(features.shape)
+    given = features.new_empty(0, count) if grad_product is None else grad_product.contiguous()
+    inputs = [
+        channels(given, lanes),
+        channels(grad_values.contiguous(), lanes),
+        channels(features.contiguous(), lanes),
+        array(points.contiguous(), 4),
+        array(mean.contiguous(), 4),
+        channels(weight.contiguous(), lanes),
+        array(voxel.contiguous()),
+        channels(argmax, lanes),
+        int(relu),
+        *(channels(grad, lanes) for grad in grads),
+    ]
+    kernel = _kernels(WARP_FLOAT[features.dtype], lanes).backward
+    launch(kernel, (len(features), count // lanes), inputs, features.device)
+    return grads
+
+
+@_attend_backward.register_fake
+def _(
+    grad_product: Tensor | None,
+    grad_values: Tensor,
+    features: Tensor,
+    points: Tensor,
+    mean: Tensor,
+    weight: Tensor,
+    voxel: Tensor,
+    argmax: Tensor,
+    relu: bool,
+) -> tuple[Tensor, Tensor]:
+    return features.new_empty(features.shape), features.new_empty(features.shape)
+
+
+def _save(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:
+    features, points, mean, weight, voxel, _, _, ctx.relu = inputs
+    ctx.mark_non_differentiable(output[2])
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(features, points, mean, weight, voxel, output[2])
+
+
+def _backward(ctx: Any, grad_product: Tensor | None, grad_values: Tensor | None, _: Any) -> tuple[Tensor | None, ...]:
+    features, points, mean, weight, voxel, argmax = ctx.saved_tensors
+    if grad_values is None:
+        grad_values = features.new_zeros(mean.shape[0], features.shape[1])
+    grad_features, grad_attention = _attend_backward(
+        grad_product, grad_values, features, points, mean, weight, voxel, argmax, ctx.relu
+    )
+    of_point = mean[voxel]
+    knowledge = torch.cat(
+        (points[:, :3] - of_point[:, :3], points[:, 3:], of_point, torch.ones_like(points[:, :1])), dim=1
+    )
+    return grad_features, None, None, knowledge.T @ grad_attention, None, None, None, None
+
+
+_attend.register_autograd(_backward, setup_context=_save)
