@@ -11,6 +11,8 @@ from torch import Tensor
 from hvnet.boxes import bev_corners
 
 TRUTH_COLOUR = "#1a9850"
+SHOWN_SCORE = 0.3
+"""Detections below are left out of pictures, which they would only fill."""
 CLASS_COLOURS = ("#d62728", "#1f77b4", "#ff7f0e", "#9467bd")
 
 
@@ -28,8 +30,10 @@ def draw_bev(
     """Writes a bird's eye view: points (N, 4) coloured by height, true boxes (T, 7) and detections (M, 7).
 
     A line from each box's centre to its front shows the heading; detections carry their scores (M,), and labels (M,)
-    index the class names.
+    index the class names; those of scores below SHOWN_SCORE are not drawn.
     """
+    shown = scores >= SHOWN_SCORE
+    boxes, scores, labels = boxes[shown], scores[shown], labels[shown]
     x_min, y_min, z_min, x_max, y_max, z_max = point_range
     inside = (points[:, 0] >= x_min) & (points[:, 0] < x_max) & (points[:, 1] >= y_min) & (points[:, 1] < y_max)
     x, y, z = points[inside, :3].cpu().numpy().T
@@ -55,7 +59,7 @@ def draw_bev(
     axes.set_aspect("equal")
     axes.set_xlabel("to the right (m)")
     axes.set_ylabel("forward (m)")
-    axes.set_title(title)
+    axes.set_title(f"{title}, score ≥ {SHOWN_SCORE}")
     if handles:
         axes.legend(handles=handles, loc="upper right", fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)

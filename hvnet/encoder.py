@@ -1,5 +1,7 @@
 """Hybrid voxel feature extraction (Sec. 3.1 and 3.2): points to pseudo-images, at voxel scales S_T and S_R."""
 
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -11,11 +13,12 @@ from hvnet.kernels.encode import (
     attend,
     clear_voxels,
     encode_voxels,
+    knowledge,
     project_voxels,
     scales_of,
     voxel_means,
 )
-from hvnet.kernels.scatter import segment_gather, segment_mean
+from hvnet.kernels.scatter import Segments, segment_gather, segment_mean
 from hvnet.kernels.voxel import Grid, Voxels, is_nested, make_grid, nested_index, voxel_index
 
 POINT_CHANNELS = 4  # d: x, y, z, reflectance
@@ -44,32 +47,31 @@ def projection_grids(config: EncoderConfig) -> list[Grid]:
     return grids
 
 
-def attention_knowledge(points: Tensor, mean: Tensor, voxels: Voxels) -> Tensor:
-    """Eq. 2: g = (x - mean x, f, mean p) of every point (N, d), from the means (V, d) of the voxels: (N, 2d)."""
-    of_point = mean[voxels.segments.voxel]
-    return torch.cat((points[:, :3] - of_point[:, :3], points[:, 3:], of_point), dim=1)
+def moments(rows: Tensor) -> Tensor:
+    """Sums of products of the columns of rows (R, k), the last of them 1, in float64: (k, k)."""
+    wide = rows.double()
+    return wide.T @ wide
 
 
-def folded(linear: nn.Linear, norm: nn.BatchNorm1d, rows: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Linear and batch norm as one affine map: the weight (in, out) and the bias (out,) that come to the same.
+def folded(linear: nn.Linear, norm: nn.BatchNorm1d, of_rows: Tensor | None) -> Tensor:
+    """Linear and batch norm as one affine map (in + 1, out), the bias last.
 
-    In training the statistics of Linear(rows) follow from those of the rows (R, in) themselves, W mean and W cov W':
-    the output is not needed for them. Rows are None where there are too few for a variance, and in evaluation: then
-    the running statistics serve.
+    In training the statistics of Linear(rows) follow from the moments (in + 1, in + 1) of the rows, as W mean and
+    W cov W': the output is not needed for them. Without moments (in evaluation, and where there are too few rows for a
+    variance) the running statistics serve.
     """
     weight = linear.weight
-    if rows is None:
+    if of_rows is None:
         mean, variance = norm.get_buffer("running_mean"), norm.get_buffer("running_var")
     else:
-        wide = rows.double()
-        centre = wide.mean(dim=0)
-        offset = wide - centre
-        covariance = (offset.T @ offset / len(rows)).to(weight.dtype)
+        count = of_rows[-1, -1]
+        centre = of_rows[-1, :-1] / count
+        covariance = (of_rows[:-1, :-1] / count - torch.outer(centre, centre)).to(weight.dtype)
         mean = weight @ centre.to(weight.dtype)
-        variance = ((weight @ covariance) * weight).sum(dim=1)
-        update_statistics(norm, mean.detach(), variance.detach() * (len(rows) / (len(rows) - 1)))
+        variance = ((weight @ covariance) * weight).sum(dim=1).clamp(min=0)
+        update_statistics(norm, mean.detach(), variance.detach() * (count / (count - 1)).to(weight.dtype))
     scale = norm.weight * torch.rsqrt(variance + norm.eps)
-    return (weight * scale.unsqueeze(1)).T, norm.bias - mean * scale
+    return torch.vstack(((weight * scale.unsqueeze(1)).T, norm.bias - mean * scale))
 
 
 def update_statistics(norm: nn.BatchNorm1d, mean: Tensor, variance: Tensor) -> None:
@@ -78,6 +80,15 @@ def update_statistics(norm: nn.BatchNorm1d, mean: Tensor, variance: Tensor) -> N
     norm.get_buffer("running_mean").lerp_(mean, momentum)
     norm.get_buffer("running_var").lerp_(variance, momentum)
     norm.get_buffer("num_batches_tracked").add_(1)
+
+
+class ScaleOfPoints(NamedTuple):
+    """The voxels of one scale, and what all layers need of their points."""
+
+    cursor: Tensor  # (V,) int64
+    segments: Segments
+    mean: Tensor  # (V, d)
+    moments: Tensor  # (2d + 1, 2d + 1) float64, of g
 
 
 class AttentiveVFE(nn.Module):
@@ -96,18 +107,14 @@ class AttentiveVFE(nn.Module):
         self.relu = relu
 
     def forward(
-        self, features: Tensor, points: Tensor, means: list[Tensor], voxels: list[Voxels]
+        self, features: Tensor, points: Tensor, voxels: list[ScaleOfPoints], keep: bool
     ) -> list[tuple[Tensor, Tensor]]:
-        """BN(Linear(features)) (N, q), points (N, d), means (V, d) a scale: M (N, q), its maxima G' (V, q) a scale."""
-        rows = None
+        """BN(Linear(features)) (N, q) of points (N, d) to M (N, q), if to be kept, and G' (V, q) of every scale."""
+        of_rows = None
         if self.training and len(points) > 1:
-            knowledge = zip(means, voxels, strict=True)
-            rows = torch.cat([attention_knowledge(points, mean, at) for mean, at in knowledge])
-        weight = torch.vstack(folded(self.knowledge, self.knowledge_norm, rows))
-        return [
-            attend(features, points, mean, weight, at.segments, self.relu)
-            for mean, at in zip(means, voxels, strict=True)
-        ]
+            of_rows = torch.stack([scale.moments for scale in voxels]).sum(dim=0)
+        weight = folded(self.knowledge, self.knowledge_norm, of_rows)
+        return [attend(features, points, scale.mean, weight, scale.segments, self.relu, keep) for scale in voxels]
 
 
 class HybridVoxelEncoder(nn.Module):
@@ -132,28 +139,34 @@ class HybridVoxelEncoder(nn.Module):
         grids = list(dict.fromkeys(self.feature_grids + self.projection_grids))
         index = voxel_index(points, sample, batch_size, grids)
         points = points[index.order]
-        voxels = dict(zip(grids, index.scales, strict=True))
-        means = {grid: segment_mean(points, voxels[grid].segments) for grid in grids}
+        scales = {grid: scale_of_points(points, voxels) for grid, voxels in zip(grids, index.scales, strict=True)}
 
-        at = [voxels[grid] for grid in self.feature_grids]
-        norm = self.avfe.features_norm
-        weight, bias = folded(self.avfe.features, norm, points if self.training and len(points) > 1 else None)
-        encoded = self.avfe(points @ weight + bias, points, [means[grid] for grid in self.feature_grids], at)
+        ones = torch.ones_like(points[:, :1])
+        of_rows = moments(torch.cat((points, ones), dim=1)) if self.training and len(points) > 1 else None
+        weight = folded(self.avfe.features, self.avfe.features_norm, of_rows)
+        at = [scales[grid] for grid in self.feature_grids]
+        encoded = self.avfe(torch.addmm(weight[-1], points, weight[:-1]), points, at, keep=True)
         context = batch_norm(self.avfeo.features_norm, self.linear_of_context(encoded, at))
-        at = [voxels[grid] for grid in self.projection_grids]
-        projected = self.avfeo(context, points, [means[grid] for grid in self.projection_grids], at)
+        at = [scales[grid] for grid in self.projection_grids]
+        projected = self.avfeo(context, points, at, keep=False)
         return [
             project(maxima, scale.cursor, grid, batch_size)
             for (_, maxima), scale, grid in zip(projected, at, self.projection_grids, strict=True)
         ]
 
-    def linear_of_context(self, encoded: list[tuple[Tensor, Tensor]], voxels: list[Voxels]) -> Tensor:
+    def linear_of_context(self, encoded: list[tuple[Tensor, Tensor]], voxels: list[ScaleOfPoints]) -> Tensor:
         """Linear(H), H (N, e) = [M, G'] of every feature scale, without H: the half in G' is one row a voxel."""
         weights = self.avfeo.features.weight.chunk(2 * len(encoded), dim=1)
         total = torch.cat([product for product, _ in encoded], dim=1) @ torch.cat(weights[0::2], dim=1).T
         for (_, maxima), at, weight in zip(encoded, voxels, weights[1::2], strict=True):
             total = total + segment_gather(maxima @ weight.T, at.segments)
         return total
+
+
+def scale_of_points(points: Tensor, voxels: Voxels) -> ScaleOfPoints:
+    """Means and moments of the points (N, d) in the voxels of a scale."""
+    mean = segment_mean(points, voxels.segments)
+    return ScaleOfPoints(voxels.cursor, voxels.segments, mean, moments(knowledge(points, mean, voxels.segments.voxel)))
 
 
 def batch_norm(norm: nn.BatchNorm1d, rows: Tensor) -> Tensor:
@@ -166,7 +179,7 @@ def batch_norm(norm: nn.BatchNorm1d, rows: Tensor) -> Tensor:
 def project(features: Tensor, cursor: Tensor, grid: Grid, batch_size: int) -> Tensor:
     """Eq. 3: writes voxel features (V, C) at x = cursor div N_W, y = cursor mod N_W of a zero (B, C, N_L, N_W)."""
     image = features.new_zeros(batch_size * grid.shape[0] * grid.shape[1], features.shape[1])
-    image = image.index_copy(0, cursor, features)
+    image.index_copy_(0, cursor, features)
     return image.view(batch_size, *grid.shape, -1).permute(0, 3, 1, 2)
 
 
@@ -196,28 +209,28 @@ class FusedEncoder:
         scales = dict(zip(grids, parts, strict=True))
         means = {grid: voxel_means(points, scale) for grid, scale in scales.items()}
 
-        weight, bias = folded(avfe.features, avfe.features_norm, None)
-        features = torch.addmm(bias, points, weight)
-        knowledge = torch.vstack(folded(avfe.knowledge, avfe.knowledge_norm, None))
+        weight = folded(avfe.features, avfe.features_norm, None)
+        features = torch.addmm(weight[-1], points, weight[:-1])
+        weight = folded(avfe.knowledge, avfe.knowledge_norm, None)
         count = features.shape[1]
         at = [scales[grid] for grid in encoder.feature_grids]
         product = features.new_empty(len(points), len(at) * count)  # M of every feature scale
         maxima = [
-            encode_voxels(features, points, means[grid], knowledge, scales[grid], avfe.relu, product, t)
+            encode_voxels(features, points, means[grid], weight, scales[grid], avfe.relu, product, t)
             for t, grid in enumerate(encoder.feature_grids)
         ]
-        weight, bias = folded(avfeo.features, avfeo.features_norm, None)
-        halves = weight.chunk(2 * len(at))
-        context = torch.addmm(bias, product, torch.cat(halves[0::2]))
+        weight = folded(avfeo.features, avfeo.features_norm, None)
+        halves = weight[:-1].chunk(2 * len(at))
+        context = torch.addmm(weight[-1], product, torch.cat(halves[0::2]))
         of_voxels = context.new_empty(len(at), max(scale.rows for scale in at), context.shape[1])
         for t, (values, half) in enumerate(zip(maxima, halves[1::2], strict=True)):
             torch.mm(values, half, out=of_voxels[t, : len(values)])
         add_of_voxels(context, of_voxels, index.voxel[: len(at)], kept)
-        knowledge = torch.vstack(folded(avfeo.knowledge, avfeo.knowledge_norm, None))
+        weight = folded(avfeo.knowledge, avfeo.knowledge_norm, None)
         images = []
         for grid in encoder.projection_grids:
             image = self.image(grid, scales[grid], batch_size, context.shape[1], dtype, points.device)
-            project_voxels(context, points, means[grid], knowledge, scales[grid], avfeo.relu, image)
+            project_voxels(context, points, means[grid], weight, scales[grid], avfeo.relu, image)
             images.append(image.view(batch_size, *grid.shape, -1).permute(0, 3, 1, 2))
         return images
 

@@ -12,7 +12,7 @@ from hvnet.anchors import assign_targets, decode, make_anchors
 from hvnet.backbone import Backbone
 from hvnet.cli import InputError
 from hvnet.config import Config, config_from_dict
-from hvnet.encoder import HybridVoxelEncoder
+from hvnet.encoder import FusedEncoder, HybridVoxelEncoder
 from hvnet.head import Head, HeadMaps
 from hvnet.kernels.rotated import rotated_nms
 from hvnet.loss import class_loss
@@ -33,6 +33,7 @@ class HVNet(nn.Module):
         super().__init__()
         self.config = config
         self.encoder = HybridVoxelEncoder(config.encoder)
+        self.fused = FusedEncoder(self.encoder)
         self.backbone = Backbone(config.backbone, config.encoder.image_channels, len(config.encoder.projection_scales))
         channels = config.backbone.fusion_channels
         self.heads = nn.ModuleList(Head(entry, channels, config.head.direction) for entry in config.head.classes)
@@ -46,8 +47,11 @@ class HVNet(nn.Module):
 
     def forward(self, points: Tensor, sample: Tensor, batch_size: int) -> list[HeadMaps]:
         """Points (N, 4) of samples (N,) to the maps of every class."""
-        images = self.encoder(points, sample, batch_size)
-        with torch.autocast(points.device.type, torch.bfloat16, enabled=self.config.train.bfloat16):
+        return self.maps_of(self.encoder(points, sample, batch_size))
+
+    def maps_of(self, images: list[Tensor]) -> list[HeadMaps]:
+        """Pseudo-images, finest first, to the maps of every class."""
+        with torch.autocast(images[0].device.type, torch.bfloat16, enabled=self.config.train.bfloat16):
             levels = self.backbone(images)
             return [head(levels[entry.level]) for head, entry in zip(self.heads, self.config.head.classes, strict=True)]
 
@@ -63,8 +67,10 @@ class HVNet(nn.Module):
 
     @torch.no_grad()
     def detect(self, points: Tensor, sample: Tensor, batch_size: int) -> list[Detections]:
-        """Boxes of every sample: scores above the threshold, then rotated NMS class by class."""
-        maps = self(points, sample, batch_size)
+        """Boxes of every sample, in evaluation mode: scores above the threshold, then rotated NMS class by class."""
+        if self.training:
+            raise RuntimeError("detect: the model is in training mode; call eval() first")
+        maps = self.maps_of(self.fused(points, sample, batch_size))
         samples = []
         for b in range(batch_size):
             parts = [self._detect_class(label, of_class.of_sample(b)) for label, of_class in enumerate(maps)]

@@ -21,20 +21,26 @@ KNOWLEDGE = 9  # rows of a weight: x - mean x (3), f, mean p (4), and the bias
 
 
 def attend(
-    features: Tensor, points: Tensor, mean: Tensor, weight: Tensor, voxels: Segments, relu: bool = False
+    features: Tensor,
+    points: Tensor,
+    mean: Tensor,
+    weight: Tensor,
+    voxels: Segments,
+    relu: bool = False,
+    keep: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """M (N, C) and its maxima G' (V, C) for features (N, C) of points (N, 4) in voxels of means (V, 4).
 
     The weight (9, C) holds the transposed W of g and, last, the bias b. With relu, features and attention go through a
-    ReLU before the product. A tie goes to the last point of the segment. Gradients to features and weight; the points
-    are given. Raises TypeError or ValueError naming the argument.
+    ReLU before the product; unless M is to be kept, it is (0, C). A tie goes to the last point of the segment.
+    Gradients go to features and weight; the points are given. Raises TypeError or ValueError naming the argument.
     """
     check_tensor("features", features, FLOATS, (None, None))
     count = features.shape[1]
     check_tensor("points", points, (features.dtype,), (len(features), 4), like=features)
     check_tensor("mean", mean, (features.dtype,), (len(voxels.starts) - 1, 4), like=features)
     check_tensor("weight", weight, (features.dtype,), (KNOWLEDGE, count), like=features)
-    product, values, _ = _attend(features, points, mean, weight, voxels.voxel, voxels.order, voxels.starts, relu)
+    product, values, _ = _attend(features, points, mean, weight, voxels.voxel, voxels.order, voxels.starts, relu, keep)
     return product, values
 
 
@@ -113,6 +119,12 @@ def clear_voxels(image: Tensor, scale: Scale) -> None:
     launch(kernel, (scale.rows, count // lanes), inputs, image.device)
 
 
+def knowledge(points: Tensor, mean: Tensor, voxel: Tensor) -> Tensor:
+    """Eq. 2 with a 1 for the bias: (x - mean x, f, mean p, 1) (N, 9) of points (N, 4) in voxels (N,) of means (V, 4)."""
+    of_point = mean[voxel]
+    return torch.cat((points[:, :3] - of_point[:, :3], points[:, 3:], of_point, torch.ones_like(points[:, :1])), dim=1)
+
+
 @functools.cache
 def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
     """The kernels for one floating type and vector length, in a module of their own."""
@@ -167,7 +179,8 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
                 attention = wp.max(attention, vec())
                 row = wp.max(row, vec())
             row = wp.cw_mul(row, attention)
-            product[i, c] = row
+            if product.shape[0] > 0:
+                product[i, c] = row
             if k == start:
                 best = row
                 at = places(i)
@@ -186,39 +199,41 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         points: wp.array(dtype=point),
         mean: wp.array(dtype=point),
         weight: wp.array2d(dtype=vec),
-        voxels: wp.array(dtype=wp.int64),
+        order: wp.array(dtype=wp.int64),
+        starts: wp.array(dtype=wp.int64),
         argmax: wp.array2d(dtype=places),
         relu: int,
         grad_features: wp.array2d(dtype=vec),
         grad_attention: wp.array2d(dtype=vec),
     ):
-        i, c = wp.tid()
-        voxel = int(voxels[i])
+        voxel, c = wp.tid()
+        centre = mean[voxel]
+        shared = of_voxel(weight, c, centre)
+        w0, w1, w2, w3 = weight[0, c], weight[1, c], weight[2, c], weight[3, c]
         given = grad_values[voxel, c]
         at = argmax[voxel, c]
-        taken = vec()
-        for lane in range(lanes):
-            if at[lane] == i:
-                taken[lane] = given[lane]
-        if grad_product.shape[0] > 0:
-            taken += grad_product[i, c]
-        centre = mean[voxel]
-        attention = of_voxel(weight, c, centre) + of_point(
-            weight[0, c], weight[1, c], weight[2, c], weight[3, c], points[i], centre
-        )
-        row = features[i, c]
-        to_features = taken
-        to_attention = taken
-        if relu != 0:
+        for k in range(int(starts[voxel]), int(starts[voxel + 1])):
+            i = point_at(order, k)
+            attention = shared + of_point(w0, w1, w2, w3, points[i], centre)
+            row = features[i, c]
+            taken = vec()
+            if grad_product.shape[0] > 0:
+                taken = grad_product[i, c]
             for lane in range(lanes):
-                if not (row[lane] > zero):
-                    to_features[lane] = zero
-                if not (attention[lane] > zero):
-                    to_attention[lane] = zero
-            row = wp.max(row, vec())
-            attention = wp.max(attention, vec())
-        grad_features[i, c] = wp.cw_mul(to_features, attention)
-        grad_attention[i, c] = wp.cw_mul(to_attention, row)
+                if at[lane] == i:
+                    taken[lane] = taken[lane] + given[lane]
+            to_features = taken
+            to_attention = taken
+            if relu != 0:
+                for lane in range(lanes):
+                    if not (row[lane] > zero):
+                        to_features[lane] = zero
+                    if not (attention[lane] > zero):
+                        to_attention[lane] = zero
+                row = wp.max(row, vec())
+                attention = wp.max(attention, vec())
+            grad_features[i, c] = wp.cw_mul(to_features, attention)
+            grad_attention[i, c] = wp.cw_mul(to_attention, row)
 
     @wp.kernel(enable_backward=False, module=module)
     def encode(
@@ -368,9 +383,10 @@ def _attend(
     order: Tensor | None,
     starts: Tensor,
     relu: bool,
+    keep: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     count, lanes = features.shape[1], lanes_of(features.shape[1])
-    product = features.new_empty(features.shape)
+    product = features.new_empty(len(features) if keep else 0, count)
     values = features.new_empty(len(mean), count)
     argmax = torch.empty(len(mean), count, dtype=torch.int32, device=features.device)
     inputs = [
@@ -398,9 +414,11 @@ def _(
     order: Tensor | None,
     starts: Tensor,
     relu: bool,
+    keep: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     values = features.new_empty(len(mean), features.shape[1])
-    return features.new_empty(features.shape), values, torch.empty_like(values, dtype=torch.int32)
+    product = features.new_empty(len(features) if keep else 0, features.shape[1])
+    return product, values, torch.empty_like(values, dtype=torch.int32)
 
 
 @torch.library.custom_op("hvnet::attend_backward", mutates_args=())
@@ -411,7 +429,8 @@ def _attend_backward(
     points: Tensor,
     mean: Tensor,
     weight: Tensor,
-    voxel: Tensor,
+    order: Tensor | None,
+    starts: Tensor,
     argmax: Tensor,
     relu: bool,
 ) -> tuple[Tensor, Tensor]:
@@ -425,13 +444,14 @@ def _attend_backward(
         array(points.contiguous(), 4),
         array(mean.contiguous(), 4),
         channels(weight.contiguous(), lanes),
-        array(voxel.contiguous()),
+        array(starts.new_empty(0) if order is None else order.contiguous()),
+        array(starts.contiguous()),
         channels(argmax, lanes),
         int(relu),
         *(channels(grad, lanes) for grad in grads),
     ]
     kernel = _kernels(WARP_FLOAT[features.dtype], lanes).backward
-    launch(kernel, (len(features), count // lanes), inputs, features.device)
+    launch(kernel, (len(mean), count // lanes), inputs, features.device)
     return grads
 
 
@@ -443,7 +463,8 @@ def _(
     points: Tensor,
     mean: Tensor,
     weight: Tensor,
-    voxel: Tensor,
+    order: Tensor | None,
+    starts: Tensor,
     argmax: Tensor,
     relu: bool,
 ) -> tuple[Tensor, Tensor]:
@@ -451,24 +472,21 @@ def _(
 
 
 def _save(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:
-    features, points, mean, weight, voxel, _, _, ctx.relu = inputs
+    *tensors, ctx.relu, ctx.keep = inputs
     ctx.mark_non_differentiable(output[2])
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(features, points, mean, weight, voxel, output[2])
+    ctx.save_for_backward(*tensors, output[2])
 
 
 def _backward(ctx: Any, grad_product: Tensor | None, grad_values: Tensor | None, _: Any) -> tuple[Tensor | None, ...]:
-    features, points, mean, weight, voxel, argmax = ctx.saved_tensors
+    features, points, mean, weight, voxel, order, starts, argmax = ctx.saved_tensors
     if grad_values is None:
         grad_values = features.new_zeros(mean.shape[0], features.shape[1])
     grad_features, grad_attention = _attend_backward(
-        grad_product, grad_values, features, points, mean, weight, voxel, argmax, ctx.relu
+        grad_product if ctx.keep else None, grad_values, features, points, mean, weight, order, starts, argmax, ctx.relu
     )
-    of_point = mean[voxel]
-    knowledge = torch.cat(
-        (points[:, :3] - of_point[:, :3], points[:, 3:], of_point, torch.ones_like(points[:, :1])), dim=1
-    )
-    return grad_features, None, None, knowledge.T @ grad_attention, None, None, None, None
+    grad_weight = knowledge(points, mean, voxel).T @ grad_attention
+    return grad_features, None, None, grad_weight, None, None, None, None, None
 
 
 _attend.register_autograd(_backward, setup_context=_save)

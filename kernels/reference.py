@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
+    from .scatter import Segments
     from .voxel import Grid
 
 Box = Sequence[float]  # x, y, z, l, w, h, yaw in metres and radians
@@ -142,6 +143,36 @@ def _iou_bev(a: Box, b: Box) -> float:
 def _iou_3d(a: Box, b: Box) -> float:
     height = max(min(a[5], b[5], (a[5] + b[5]) / 2 - abs(a[2] - b[2])), 0.0)
     return _ratio(_overlap(a, b) * height, a[3] * a[4] * a[5], b[3] * b[4] * b[5])
+
+
+def attend(
+    features: Tensor,
+    points: Tensor,
+    mean: Tensor,
+    weight: Tensor,
+    voxels: Segments,
+    relu: bool = False,
+    keep: bool = True,
+) -> tuple[Tensor, Tensor]:
+    """M (N, C) and its maxima (V, C): features (N, C) times the attention W g + b of points (N, 4) in their voxels.
+
+    The weight (9, C) is that of g = (x - mean x, f, mean p) of Eq. 2 and, last, the bias; see encode.attend.
+    """
+    attention = knowledge(points, mean, voxels.voxel) @ weight
+    if relu:
+        features, attention = features.relu(), attention.relu()
+    product = features * attention
+    values, _ = scatter_max(product, voxels.voxel, len(mean))
+    return product if keep else product[:0], values
+
+
+def knowledge(points: Tensor, mean: Tensor, voxel: Tensor) -> Tensor:
+    """Eq. 2 and a 1 for the bias (N, 9), of points (N, 4) in voxels (N,) of means (V, 4)."""
+    rows = [
+        torch.cat((p[:3] - mean[v, :3], p[3:], mean[v], p.new_ones(1)))
+        for p, v in zip(points, voxel.tolist(), strict=True)
+    ]
+    return torch.stack(rows) if rows else points.new_zeros(0, 9)
 
 
 def rotated_overlap_pairs(a: Tensor, b: Tensor) -> Tensor:
