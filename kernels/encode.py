@@ -50,7 +50,7 @@ class Scale(NamedTuple):
     voxel: Tensor  # (N,) int64, the voxel of each point
     starts: Tensor  # int64, where each voxel's points start
     cursor: Tensor  # int64, cursor of each voxel
-    count: Tensor  # (1,) int64, number of voxels, on the device
+    counts: Tensor  # (1,) int64, number of voxels, on the device
     rows: int  # as many voxels or more, known on the host
 
 
@@ -70,7 +70,7 @@ def scales_of(index: NestedIndex) -> tuple[list[Scale], Tensor, int]:
 def voxel_means(points: Tensor, scale: Scale) -> Tensor:
     """Means (rows, 4) of the points (N, 4) float32 of each voxel."""
     mean = points.new_empty(scale.rows, 4)
-    inputs = [array(points, 4), array(scale.starts), array(scale.count), array(mean, 4)]
+    inputs = [array(points, 4), array(scale.starts), array(scale.counts), array(mean, 4)]
     launch(_means, scale.rows, inputs, points.device)
     return mean
 
@@ -83,7 +83,7 @@ def encode_voxels(
     lanes = lanes_of(count)
     values = features.new_empty(scale.rows, count)
     inputs = [channels(features, lanes), array(points, 4), array(mean, 4), channels(weight, lanes)]
-    inputs += [array(scale.starts), array(scale.count), int(relu), part * count // lanes]
+    inputs += [array(scale.starts), array(scale.counts), int(relu), part * count // lanes]
     inputs += [channels(product, lanes), channels(values, lanes)]
     launch(_kernels(wp.float32, lanes).encode, (scale.rows, count // lanes), inputs, features.device)
     return values
@@ -105,7 +105,7 @@ def project_voxels(
     count = features.shape[1]
     lanes = lanes_of(count)
     inputs = [channels(features, lanes), array(points, 4), array(mean, 4), channels(weight, lanes)]
-    inputs += [array(scale.starts), array(scale.count), array(scale.cursor), int(relu), channels(image, lanes)]
+    inputs += [array(scale.starts), array(scale.counts), array(scale.cursor), int(relu), channels(image, lanes)]
     kernel = _project_kernel(lanes, wp.dtype_from_torch(image.dtype))
     launch(kernel, (scale.rows, count // lanes), inputs, features.device)
 
@@ -115,12 +115,12 @@ def clear_voxels(image: Tensor, scale: Scale) -> None:
     count = image.shape[1]
     lanes = lanes_of(count)
     kernel = _clear_kernel(lanes, wp.dtype_from_torch(image.dtype))
-    inputs = [array(scale.cursor), array(scale.count), channels(image, lanes)]
+    inputs = [array(scale.cursor), array(scale.counts), channels(image, lanes)]
     launch(kernel, (scale.rows, count // lanes), inputs, image.device)
 
 
 def knowledge(points: Tensor, mean: Tensor, voxel: Tensor) -> Tensor:
-    """Eq. 2 with a 1 for the bias: (x - mean x, f, mean p, 1) (N, 9) of points (N, 4) in voxels (N,) of means (V, 4)."""
+    """Eq. 2 and a 1 for the bias: (x - mean x, f, mean p, 1), (N, 9), of points (N, 4) in voxels (N,) of means (V, 4)."""
     of_point = mean[voxel]
     return torch.cat((points[:, :3] - of_point[:, :3], points[:, 3:], of_point, torch.ones_like(points[:, :1])), dim=1)
 

@@ -45,8 +45,8 @@ class VoxelIndex(NamedTuple):
 class NestedIndex(NamedTuple):
     """The voxels of S nested scales in arrays of fixed size, so that no length has to be read from the device.
 
-    Of N points the first `kept` in the new order are inside every grid; scale s has `counts[s]` voxels. What lies beyond
-    is not set.
+    Of N points the first `kept` in the new order are inside every grid; scale s has `counts[s]` voxels. The rest is
+    not set.
     """
 
     order: Tensor  # (N,) int64, indices into the points given
