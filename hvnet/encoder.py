@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from hvnet.config import EncoderConfig
@@ -12,6 +11,7 @@ from hvnet.kernels.encode import (
     add_of_voxels,
     attend,
     clear_voxels,
+    column_sums,
     encode_voxels,
     knowledge,
     project_voxels,
@@ -111,7 +111,7 @@ class AttentiveVFE(nn.Module):
     ) -> list[tuple[Tensor, Tensor]]:
         """BN(Linear(features)) (N, q) of points (N, d) to M (N, q), if to be kept, and G' (V, q) of every scale."""
         of_rows = None
-        if self.training and len(points) > 1:
+        if self.training and points.shape[0] > 1:
             of_rows = torch.stack([scale.moments for scale in voxels]).sum(dim=0)
         weight = folded(self.knowledge, self.knowledge_norm, of_rows)
         return [attend(features, points, scale.mean, weight, scale.segments, self.relu, keep) for scale in voxels]
@@ -142,7 +142,7 @@ class HybridVoxelEncoder(nn.Module):
         scales = {grid: scale_of_points(points, voxels) for grid, voxels in zip(grids, index.scales, strict=True)}
 
         ones = torch.ones_like(points[:, :1])
-        of_rows = moments(torch.cat((points, ones), dim=1)) if self.training and len(points) > 1 else None
+        of_rows = moments(torch.cat((points, ones), dim=1)) if self.training and points.shape[0] > 1 else None
         weight = folded(self.avfe.features, self.avfe.features_norm, of_rows)
         at = [scales[grid] for grid in self.feature_grids]
         encoded = self.avfe(torch.addmm(weight[-1], points, weight[:-1]), points, at, keep=True)
@@ -170,10 +170,21 @@ def scale_of_points(points: Tensor, voxels: Voxels) -> ScaleOfPoints:
 
 
 def batch_norm(norm: nn.BatchNorm1d, rows: Tensor) -> Tensor:
-    """Batch norm of rows (N, C); a batch of fewer than two rows has no variance and takes the running one."""
-    if norm.training and len(rows) < 2:
-        return F.batch_norm(rows, norm.running_mean, norm.running_var, norm.weight, norm.bias, False, 0.0, norm.eps)
-    return norm(rows)
+    """Batch norm of rows (N, C), whose sums do not depend on the number of threads as torch's do.
+
+    A batch of fewer than two rows has no variance and takes the running one.
+    """
+    count = rows.shape[0]
+    if not norm.training or count < 2:
+        mean, variance = norm.get_buffer("running_mean"), norm.get_buffer("running_var")
+    else:
+        total, squares = column_sums(rows)
+        mean = total / count
+        variance = (squares / count - mean.square()).clamp(min=0).to(rows.dtype)
+        mean = mean.to(rows.dtype)
+        update_statistics(norm, mean.detach(), variance.detach() * (count / (count - 1)))
+    scale = norm.weight * torch.rsqrt(variance + norm.eps)
+    return torch.addcmul(norm.bias - mean * scale, rows, scale)
 
 
 def project(features: Tensor, cursor: Tensor, grid: Grid, batch_size: int) -> Tensor:
@@ -214,7 +225,7 @@ class FusedEncoder:
         weight = folded(avfe.knowledge, avfe.knowledge_norm, None)
         count = features.shape[1]
         at = [scales[grid] for grid in encoder.feature_grids]
-        product = features.new_empty(len(points), len(at) * count)  # M of every feature scale
+        product = features.new_empty(points.shape[0], len(at) * count)  # M of every feature scale
         maxima = [
             encode_voxels(features, points, means[grid], weight, scales[grid], avfe.relu, product, t)
             for t, grid in enumerate(encoder.feature_grids)

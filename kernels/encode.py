@@ -10,6 +10,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 import warp as wp
 from torch import Tensor
 
@@ -17,6 +18,7 @@ from hvnet.kernels.launch import FLOATS, WARP_FLOAT, array, channels, check_tens
 from hvnet.kernels.scatter import Segments
 from hvnet.kernels.voxel import NestedIndex
 
+ROWS = 1024  # rows that are summed as one block
 KNOWLEDGE = 9  # rows of a weight: x - mean x (3), f, mean p (4), and the bias
 
 
@@ -37,11 +39,17 @@ def attend(
     """
     check_tensor("features", features, FLOATS, (None, None))
     count = features.shape[1]
-    check_tensor("points", points, (features.dtype,), (len(features), 4), like=features)
-    check_tensor("mean", mean, (features.dtype,), (len(voxels.starts) - 1, 4), like=features)
+    check_tensor("points", points, (features.dtype,), (features.shape[0], 4), like=features)
+    check_tensor("mean", mean, (features.dtype,), (voxels.starts.shape[0] - 1, 4), like=features)
     check_tensor("weight", weight, (features.dtype,), (KNOWLEDGE, count), like=features)
     product, values, _ = _attend(features, points, mean, weight, voxels.voxel, voxels.order, voxels.starts, relu, keep)
     return product, values
+
+
+def column_sums(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Sums (C,) of the columns of rows (N, C) and of their squares, in float64 and in a fixed order."""
+    check_tensor("rows", rows, FLOATS, (None, None))
+    return _column_sums(rows)
 
 
 class Scale(NamedTuple):
@@ -95,7 +103,7 @@ def add_of_voxels(features: Tensor, of_voxels: Tensor, voxel: Tensor, kept: Tens
     lanes = lanes_of(count)
     wide = array(of_voxels.view(scales, rows, count // lanes, lanes), lanes)
     inputs = [wide, array(voxel), array(kept), channels(features, lanes)]
-    launch(_context_kernel(lanes), (len(features), count // lanes), inputs, features.device)
+    launch(_context_kernel(lanes), (features.shape[0], count // lanes), inputs, features.device)
 
 
 def project_voxels(
@@ -120,7 +128,7 @@ def clear_voxels(image: Tensor, scale: Scale) -> None:
 
 
 def knowledge(points: Tensor, mean: Tensor, voxel: Tensor) -> Tensor:
-    """Eq. 2 and a 1 for the bias: (x - mean x, f, mean p, 1), (N, 9), of points (N, 4) in voxels (N,) of means (V, 4)."""
+    """Eq. 2 and a 1 for the bias: (x - mean x, f, mean p, 1) of points (N, 4) in voxels (N,), means (V, 4): (N, 9)."""
     of_point = mean[voxel]
     return torch.cat((points[:, :3] - of_point[:, :3], points[:, 3:], of_point, torch.ones_like(points[:, :1])), dim=1)
 
@@ -131,6 +139,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
     vec = wp.types.vector(length=lanes, dtype=dtype)
     point = wp.types.vector(length=4, dtype=dtype)
     places = wp.types.vector(length=lanes, dtype=wp.int32)
+    wide = wp.types.vector(length=lanes, dtype=wp.float64)
     module = wp.Module(f"hvnet_encode_{dtype.__name__}_{lanes}", None)
     zero = dtype(0.0)
 
@@ -270,7 +279,23 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
             best = wp.max(best, row)
         values[voxel, c] = best
 
-    return SimpleNamespace(forward=forward, backward=backward, encode=encode, of_voxel=of_voxel, of_point=of_point)
+    @wp.kernel(enable_backward=False, module=module)
+    def sums(rows: wp.array2d(dtype=vec), total: wp.array2d(dtype=wide), squares: wp.array2d(dtype=wide)):
+        block, c = wp.tid()
+        a = wide()
+        b = wide()
+        for i in range(block * ROWS, wp.min((block + 1) * ROWS, rows.shape[0])):
+            row = rows[i, c]
+            for lane in range(lanes):
+                value = wp.float64(row[lane])
+                a[lane] = a[lane] + value
+                b[lane] = b[lane] + value * value
+        total[block, c] = a
+        squares[block, c] = b
+
+    return SimpleNamespace(
+        forward=forward, backward=backward, encode=encode, sums=sums, of_voxel=of_voxel, of_point=of_point
+    )
 
 
 @functools.cache
@@ -386,9 +411,9 @@ def _attend(
     keep: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     count, lanes = features.shape[1], lanes_of(features.shape[1])
-    product = features.new_empty(len(features) if keep else 0, count)
-    values = features.new_empty(len(mean), count)
-    argmax = torch.empty(len(mean), count, dtype=torch.int32, device=features.device)
+    product = features.new_empty(features.shape[0] if keep else 0, count)
+    values = features.new_empty(mean.shape[0], count)
+    argmax = torch.empty(mean.shape[0], count, dtype=torch.int32, device=features.device)
     inputs = [
         channels(features.contiguous(), lanes),
         array(points.contiguous(), 4),
@@ -400,7 +425,7 @@ def _attend(
         *(channels(output, lanes) for output in (product, values, argmax)),
     ]
     kernel = _kernels(WARP_FLOAT[features.dtype], lanes).forward
-    launch(kernel, (len(mean), count // lanes), inputs, features.device)
+    launch(kernel, (mean.shape[0], count // lanes), inputs, features.device)
     return product, values, argmax
 
 
@@ -416,8 +441,8 @@ def _(
     relu: bool,
     keep: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    values = features.new_empty(len(mean), features.shape[1])
-    product = features.new_empty(len(features) if keep else 0, features.shape[1])
+    values = features.new_empty(mean.shape[0], features.shape[1])
+    product = features.new_empty(features.shape[0] if keep else 0, features.shape[1])
     return product, values, torch.empty_like(values, dtype=torch.int32)
 
 
@@ -429,6 +454,7 @@ def _attend_backward(
     points: Tensor,
     mean: Tensor,
     weight: Tensor,
+    voxel: Tensor,
     order: Tensor | None,
     starts: Tensor,
     argmax: Tensor,
@@ -451,8 +477,16 @@ def _attend_backward(
         *(channels(grad, lanes) for grad in grads),
     ]
     kernel = _kernels(WARP_FLOAT[features.dtype], lanes).backward
-    launch(kernel, (len(mean), count // lanes), inputs, features.device)
-    return grads
+    launch(kernel, (mean.shape[0], count // lanes), inputs, features.device)
+    return grads[0], _product_of_columns(knowledge(points, mean, voxel), grads[1])
+
+
+def _product_of_columns(a: Tensor, b: Tensor) -> Tensor:
+    """a' b of a (N, k) and b (N, C) in blocks of fixed size: BLAS would split the long sum by the number of threads."""
+    blocks = max(1, -(-a.shape[0] // ROWS))
+    padding = (0, 0, 0, blocks * ROWS - a.shape[0])
+    a, b = (F.pad(matrix, padding).view(blocks, ROWS, matrix.shape[1]) for matrix in (a, b))
+    return torch.bmm(a.transpose(1, 2), b).sum(dim=0)
 
 
 @_attend_backward.register_fake
@@ -463,12 +497,13 @@ def _(
     points: Tensor,
     mean: Tensor,
     weight: Tensor,
+    voxel: Tensor,
     order: Tensor | None,
     starts: Tensor,
     argmax: Tensor,
     relu: bool,
 ) -> tuple[Tensor, Tensor]:
-    return features.new_empty(features.shape), features.new_empty(features.shape)
+    return features.new_empty(features.shape), torch.empty_like(weight)
 
 
 def _save(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:
@@ -482,11 +517,39 @@ def _backward(ctx: Any, grad_product: Tensor | None, grad_values: Tensor | None,
     features, points, mean, weight, voxel, order, starts, argmax = ctx.saved_tensors
     if grad_values is None:
         grad_values = features.new_zeros(mean.shape[0], features.shape[1])
-    grad_features, grad_attention = _attend_backward(
-        grad_product if ctx.keep else None, grad_values, features, points, mean, weight, order, starts, argmax, ctx.relu
+    given = grad_product if ctx.keep else None
+    grad_features, grad_weight = _attend_backward(
+        given, grad_values, features, points, mean, weight, voxel, order, starts, argmax, ctx.relu
     )
-    grad_weight = knowledge(points, mean, voxel).T @ grad_attention
     return grad_features, None, None, grad_weight, None, None, None, None, None
 
 
 _attend.register_autograd(_backward, setup_context=_save)
+
+
+@torch.library.custom_op("hvnet::column_sums", mutates_args=())
+def _column_sums(rows: Tensor) -> tuple[Tensor, Tensor]:
+    count, lanes = rows.shape[1], lanes_of(rows.shape[1])
+    blocks = -(-rows.shape[0] // ROWS)
+    total, squares = (torch.empty(blocks, count, dtype=torch.float64, device=rows.device) for _ in range(2))
+    inputs = [channels(rows.contiguous(), lanes), channels(total, lanes), channels(squares, lanes)]
+    launch(_kernels(WARP_FLOAT[rows.dtype], lanes).sums, (blocks, count // lanes), inputs, rows.device)
+    return total.sum(dim=0), squares.sum(dim=0)
+
+
+@_column_sums.register_fake
+def _(rows: Tensor) -> tuple[Tensor, Tensor]:
+    total = rows.new_empty(rows.shape[1], dtype=torch.float64)
+    return total, torch.empty_like(total)
+
+
+def _save_rows(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:
+    ctx.save_for_backward(*inputs)
+
+
+def _column_sums_backward(ctx: Any, grad_total: Tensor, grad_squares: Tensor) -> Tensor:
+    (rows,) = ctx.saved_tensors
+    return torch.addcmul(grad_total.to(rows.dtype), rows, 2 * grad_squares.to(rows.dtype))
+
+
+_column_sums.register_autograd(_column_sums_backward, setup_context=_save_rows)

@@ -166,6 +166,11 @@ def attend(
     return product if keep else product[:0], values
 
 
+def column_sums(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Sums (C,) of the columns of rows (N, C), and of their squares, in float64."""
+    return rows.double().sum(dim=0), rows.double().square().sum(dim=0)
+
+
 def knowledge(points: Tensor, mean: Tensor, voxel: Tensor) -> Tensor:
     """Eq. 2 and a 1 for the bias (N, 9), of points (N, 4) in voxels (N,) of means (V, 4)."""
     rows = [

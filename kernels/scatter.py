@@ -58,8 +58,8 @@ def gather(src: Tensor, index: Tensor) -> Tensor:
     """The rows src[index]: (V, C) and (N,) int64 give (N, C); the gradient is a sum in a fixed order."""
     check_tensor("src", src, FLOATS, (None, None))
     check_tensor("index", index, (torch.int64,), (None,), like=src)
-    check_index("index", index, len(src))
-    return segment_gather(src, segments(index, len(src)))
+    check_index("index", index, src.shape[0])
+    return segment_gather(src, segments(index, src.shape[0]))
 
 
 def segment_max(src: Tensor, voxels: Segments) -> tuple[Tensor, Tensor]:
@@ -81,7 +81,7 @@ def segment_gather(src: Tensor, voxels: Segments) -> Tensor:
 
 def _checked_segments(src: Tensor, index: Tensor, dim_size: int) -> Segments:
     check_tensor("src", src, FLOATS, (None, None))
-    check_tensor("index", index, (torch.int64,), (len(src),), like=src)
+    check_tensor("index", index, (torch.int64,), (src.shape[0],), like=src)
     if dim_size < 0:
         raise ValueError(f"dim_size: want 0 or more, got {dim_size}")
     check_index("index", index, dim_size)
@@ -208,50 +208,50 @@ def _order_array(order: Tensor | None, like: Tensor) -> Any:
 @torch.library.custom_op("hvnet::segment_max", mutates_args=())
 def _segment_max(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> tuple[Tensor, Tensor]:
     count, lanes = src.shape[1], lanes_of(src.shape[1])
-    values = src.new_empty(len(starts) - 1, count)
-    argmax = torch.empty(len(starts) - 1, count, dtype=torch.int32, device=src.device)
+    values = src.new_empty(starts.shape[0] - 1, count)
+    argmax = torch.empty(starts.shape[0] - 1, count, dtype=torch.int32, device=src.device)
     inputs = [channels(src.contiguous(), lanes), _order_array(order, starts), array(starts)]
     inputs += [channels(values, lanes), channels(argmax, lanes)]
     kernels = _kernels(WARP_FLOAT[src.dtype], lanes)
-    launch(kernels.maximum, (len(values), count // lanes), inputs, src.device)
-    launch(kernels.maximum_with_nan, (len(values), count // lanes), inputs, src.device)
+    launch(kernels.maximum, (values.shape[0], count // lanes), inputs, src.device)
+    launch(kernels.maximum_with_nan, (values.shape[0], count // lanes), inputs, src.device)
     return values, argmax
 
 
 @_segment_max.register_fake
 def _(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> tuple[Tensor, Tensor]:
-    values = src.new_empty(len(starts) - 1, src.shape[1])
+    values = src.new_empty(starts.shape[0] - 1, src.shape[1])
     return values, torch.empty_like(values, dtype=torch.int32)
 
 
 @torch.library.custom_op("hvnet::segment_max_backward", mutates_args=())
 def _segment_max_backward(grad: Tensor, argmax: Tensor, index: Tensor) -> Tensor:
     count, lanes = grad.shape[1], lanes_of(grad.shape[1])
-    grad_src = grad.new_empty(len(index), count)
+    grad_src = grad.new_empty(index.shape[0], count)
     inputs = [channels(grad.contiguous(), lanes), channels(argmax, lanes), array(index.contiguous())]
     inputs += [channels(grad_src, lanes)]
     kernel = _kernels(WARP_FLOAT[grad.dtype], lanes).maximum_backward
-    launch(kernel, (len(index), count // lanes), inputs, grad.device)
+    launch(kernel, (index.shape[0], count // lanes), inputs, grad.device)
     return grad_src
 
 
 @_segment_max_backward.register_fake
 def _(grad: Tensor, argmax: Tensor, index: Tensor) -> Tensor:
-    return grad.new_empty(len(index), grad.shape[1])
+    return grad.new_empty(index.shape[0], grad.shape[1])
 
 
 @torch.library.custom_op("hvnet::segment_sum", mutates_args=())
 def _segment_sum(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
     count, lanes = src.shape[1], lanes_of(src.shape[1])
-    values = src.new_empty(len(starts) - 1, count)
+    values = src.new_empty(starts.shape[0] - 1, count)
     inputs = [channels(src.contiguous(), lanes), _order_array(order, starts), array(starts), channels(values, lanes)]
-    launch(_kernels(WARP_FLOAT[src.dtype], lanes).total, (len(values), count // lanes), inputs, src.device)
+    launch(_kernels(WARP_FLOAT[src.dtype], lanes).total, (values.shape[0], count // lanes), inputs, src.device)
     return values
 
 
 @_segment_sum.register_fake
 def _(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
-    return src.new_empty(len(starts) - 1, src.shape[1])
+    return src.new_empty(starts.shape[0] - 1, src.shape[1])
 
 
 @torch.library.custom_op("hvnet::gather", mutates_args=())
@@ -261,7 +261,7 @@ def _gather(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) ->
 
 @_gather.register_fake
 def _(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
-    return src.new_empty(len(index), src.shape[1])
+    return src.new_empty(index.shape[0], src.shape[1])
 
 
 def _save_max(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:

@@ -10,7 +10,7 @@ import warp as wp
 from torch import Tensor
 
 from hvnet.kernels.launch import array, check_index, check_tensor, launch
-from hvnet.kernels.scatter import Segments
+from hvnet.kernels.scatter import Segments, segments
 
 KEY_BITS = 62  # of a sort key in int64
 OUTSIDE = wp.constant(1 << 62)  # the key of a point outside, after all others
@@ -105,26 +105,56 @@ def voxel_index(points: Tensor, sample: Tensor, batch_size: int, grids: Sequence
     too large for a key, go through the hash table.
     """
     _check_points(points, sample)
-    check_index("sample", sample, batch_size)
     if not grids:
         raise ValueError("grids: want at least one grid, got none")
+    flat = [float(value) for grid in grids for value in (*grid[:4], *grid.cell, *grid.cells, *grid.shape)]
+    order, *parts = _voxel_index(points, sample, batch_size, flat)
+    width = len(parts) // len(grids)  # 3, or 4 with an order of its own
+    scales = [parts[k : k + width] for k in range(0, len(parts), width)]
+    return VoxelIndex(order, [Voxels(s[0], Segments(s[1], s[2], s[3] if width == 4 else None)) for s in scales])
+
+
+@torch.library.custom_op("hvnet::voxel_index", mutates_args=())
+def _voxel_index(points: Tensor, sample: Tensor, batch_size: int, flat: Sequence[float]) -> list[Tensor]:
+    """Order, then cursor, voxel and starts of every scale, and its order where the scales do not nest."""
+    check_index("sample", sample, batch_size)
+    grids = _grids(flat)
     for grid in grids:
         if batch_size * grid.shape[0] * grid.shape[1] >= 2**63:
             raise ValueError(f"grids: {batch_size} samples of {grid.shape} cells have cursors beyond int64")
     if is_nested(grids, batch_size):
         nested = nested_index(points, sample, grids)
         *counts, kept = nested.counts.tolist()
-        scales = [
-            Voxels(nested.cursor[s, :v], Segments(nested.voxel[s, :kept], nested.starts[s, : v + 1], None))
-            for s, v in enumerate(counts)
-        ]
-        return VoxelIndex(nested.order[:kept], scales)
+        parts = [nested.order[:kept].clone()]
+        for s, v in enumerate(counts):
+            parts += [nested.cursor[s, :v].clone(), nested.voxel[s, :kept].clone(), nested.starts[s, : v + 1].clone()]
+        return parts
     by_scale = [cursors(points, sample, grid) for grid in grids]
     inside = by_scale[0].ge(0)
     for cursor in by_scale[1:]:
         inside &= cursor.ge(0)
     order = inside.nonzero().squeeze(1)
-    return VoxelIndex(order, [_hashed_voxels(cursor[order]) for cursor in by_scale])
+    return [order, *(part for cursor in by_scale for part in _hashed_voxels(cursor[order]))]
+
+
+@_voxel_index.register_fake
+def _(points: Tensor, sample: Tensor, batch_size: int, flat: Sequence[float]) -> list[Tensor]:
+    sizes = torch.library.get_ctx()
+    kept = sizes.new_dynamic_size(min=2)  # what is compiled is for clouds, not for none or a single point
+    parts = [sample.new_empty(kept)]
+    grids = _grids(flat)
+    for _ in grids:
+        voxels = sizes.new_dynamic_size(min=1)
+        parts += [sample.new_empty(voxels), sample.new_empty(kept), sample.new_empty(voxels + 1)]
+        if not is_nested(grids, batch_size):
+            parts.append(sample.new_empty(kept))
+    return parts
+
+
+def _grids(flat: Sequence[float]) -> list[Grid]:
+    """The grids whose ten numbers stand in a row."""
+    rows = [flat[k : k + 10] for k in range(0, len(flat), 10)]
+    return [Grid(*row[:4], (row[4], row[5]), (int(row[6]), int(row[7])), (int(row[8]), int(row[9]))) for row in rows]
 
 
 def is_nested(grids: Sequence[Grid], batch_size: int) -> bool:
@@ -196,11 +226,12 @@ def hash_index(cursor: Tensor) -> tuple[Tensor, Tensor]:
     return unique, table[slot]
 
 
-def _hashed_voxels(cursor: Tensor) -> Voxels:
+def _hashed_voxels(cursor: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Cursors (V,) in ascending order, and the segments of the points (voxel, starts, order)."""
     unique, index = hash_index(cursor)
-    values, order = torch.sort(index, stable=True)
-    starts = torch.searchsorted(values, torch.arange(len(unique) + 1, device=cursor.device))
-    return Voxels(unique, Segments(index, starts, order))
+    at = segments(index, len(unique))
+    assert at.order is not None
+    return unique, at.voxel, at.starts, at.order
 
 
 def _check_points(points: Tensor, sample: Tensor) -> None:

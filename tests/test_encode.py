@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from hvnet.kernels import reference
-from hvnet.kernels.encode import attend, knowledge
+from hvnet.kernels.encode import attend, column_sums, knowledge
 from hvnet.kernels.scatter import Segments, scatter_mean, segments
 from hvnet.kernels.voxel import hash_index
 
@@ -80,6 +80,19 @@ def test_a_tie_goes_to_the_last_point(device: torch.device) -> None:
     assert grad.tolist() == [[0, 0], [0, 0], [1.5, -1.5]]
 
 
+@pytest.mark.parametrize(("count", "channels"), [(5000, 32), (1024, 7), (1, 16), (0, 4), (3, 0)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_column_sums(count: int, channels: int, dtype: torch.dtype, device: torch.device) -> None:
+    rows = torch.randn(count, channels, dtype=dtype, device=device, requires_grad=True)
+    results = []
+    for function in (column_sums, reference.column_sums):
+        total, squares = function(rows)
+        results.append((total, squares, *torch.autograd.grad((total.cos() + squares.sin()).sum(), rows)))
+    for got, want in zip(*results, strict=True):
+        tolerance = 1e-5 if got.dtype == torch.float32 else 1e-10  # the gradient is rounded to the dtype of the rows
+        torch.testing.assert_close(got, want, rtol=tolerance, atol=tolerance)
+
+
 def test_knowledge_by_hand(device: torch.device) -> None:
     points = torch.tensor([[1.0, 2.0, 3.0, 0.5], [3.0, 2.0, 1.0, 0.1], [7.0, 7.0, 7.0, 0.7]], device=device)
     mean = torch.tensor([[2.0, 2.0, 2.0, 0.25], [7.0, 7.0, 7.0, 0.75]], device=device)
@@ -125,6 +138,7 @@ def test_opcheck() -> None:
     src = torch.randn(20, 5, requires_grad=True)
     for op in (torch.ops.hvnet.segment_max, torch.ops.hvnet.segment_sum):
         torch.library.opcheck(op, (src, at.voxel, at.order, at.starts))
+    torch.library.opcheck(torch.ops.hvnet.column_sums, (src,))
     torch.library.opcheck(
         torch.ops.hvnet.gather, (torch.randn(6, 5, requires_grad=True), at.voxel, at.order, at.starts)
     )

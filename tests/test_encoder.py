@@ -1,5 +1,6 @@
 """The encoder against the paper's equations, written out plainly in float64 with the twins."""
 
+import copy
 import dataclasses
 from pathlib import Path
 
@@ -247,3 +248,41 @@ def test_fused_encoder_on_a_real_frame(kitti_root: Path) -> None:
         # coordinates up to 64 m go through sums that cancel: relative to the image's largest value
         assert (image - plain).abs().max() <= 2e-6 * plain.abs().max()
         assert torch.equal(image != 0, plain != 0)
+
+
+@pytest.mark.parametrize("projection_scales", [(1.0, 2.0, 4.0), (1.5, 3.0)])
+@pytest.mark.parametrize("training", [True, False])
+def test_compiles_into_one_graph(projection_scales: tuple[float, ...], training: bool) -> None:
+    """torch.compile without graph breaks, forward and backward; aot_eager needs no C++ compiler."""
+    torch.manual_seed(0)
+    encoder = HybridVoxelEncoder(dataclasses.replace(SMALL, projection_scales=projection_scales)).train(training)
+    compiled = torch.compile(copy.deepcopy(encoder), fullgraph=True, backend="aot_eager", dynamic=True)
+    for count in (400, 300):
+        points, sample = cloud(count)
+        runs = []
+        for function in (encoder, compiled):
+            images = function(points, sample, 2)
+            sum(image.square().sum() for image in images).backward()
+            runs.append(images)
+        for a, b in zip(*runs, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)
+    for a, b in zip(encoder.parameters(), compiled.parameters(), strict=True):
+        torch.testing.assert_close(a.grad, b.grad, rtol=1e-4, atol=1e-4)
+
+
+def test_same_bits_with_any_number_of_threads(kitti_root: Path) -> None:
+    """20 runs, forward and backward, of the paper's encoder on a real frame, with one thread and with two."""
+    points = read_frame(kitti_root, "000008").points
+    sample = torch.zeros(len(points), dtype=torch.int64)
+    threads = torch.get_num_threads()
+    first: list[Tensor] = []
+    for run in range(20):
+        torch.set_num_threads(1 + run % 2)
+        torch.manual_seed(0)
+        encoder = HybridVoxelEncoder(EncoderConfig())
+        images = encoder(points, sample, 1)
+        torch.autograd.backward(images, [image.detach().sign() for image in images])
+        result = [*images, *(p.grad for p in encoder.parameters()), *encoder.buffers()]
+        first = first or result
+        assert all(torch.equal(a, b) for a, b in zip(result, first, strict=True))
+    torch.set_num_threads(threads)
