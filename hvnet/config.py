@@ -15,6 +15,9 @@ import yaml
 
 from hvnet.cli import InputError
 
+MOST_CELLS = 2**26
+"""Of the finest pseudo-image: 8192 x 8192, with 32 channels 8 GiB a sample."""
+
 
 @dataclass(frozen=True)
 class EncoderConfig:
@@ -258,6 +261,14 @@ def _check(config: Config, source: str) -> None:
         want(coarse == 2 * fine, f"encoder.projection_scales[{r + 1}]", f"twice the scale before, {2 * fine}", coarse)
     for key in ("feature_channels", "image_channels"):
         want(getattr(encoder, key) > 0, f"encoder.{key}", "1 or more", getattr(encoder, key))
+    finest = [v * encoder.projection_scales[0] for v in encoder.voxel_size]
+    cells = math.prod((b - a) / v for a, b, v in zip(low, high, finest, strict=False))
+    want(
+        cells <= MOST_CELLS,
+        "encoder.voxel_size",
+        f"at most {MOST_CELLS} cells in the finest projection",
+        f"{cells:.3g}",
+    )
     blocks = max(3, len(encoder.projection_scales))
     for key in ("widths", "layers"):
         values = getattr(backbone, key)

@@ -475,7 +475,18 @@ def _band(text: str) -> tuple[float, float]:
 
 def main(argv: Sequence[str] | None) -> None:
     """The command `python -m hvnet.evaluate`."""
-    parser = argparse.ArgumentParser(prog="python -m hvnet.evaluate", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m hvnet.evaluate",
+        description="Scores KITTI result files of any detector as KITTI's devkit does, and reports what is missed.",
+        epilog="examples:\n"
+        "  python -m hvnet.evaluate --labels KITTI/training/label_2 --predictions val/results \\\n"
+        "    --frames KITTI/ImageSets/val.txt --json val.json --plot val.png\n"
+        "  python -m hvnet.evaluate --labels labels --predictions results --no-2d-filter     # data without images\n"
+        "  python -m hvnet.evaluate --labels labels --predictions results --distance-bands 0-20 20-40 40-60\n"
+        "  python -m hvnet.evaluate --labels KITTI/training/label_2 --predictions results --missing-as-empty \\\n"
+        "    --clouds KITTI/training --score 0.5 --classes Car                 # where are cars missed at score 0.5?",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("--labels", type=Path, required=True, metavar="DIR", help="label files (KITTI's label_2)")
     parser.add_argument("--predictions", type=Path, required=True, metavar="DIR", help="result files with scores")
     parser.add_argument("--frames", type=Path, metavar="FILE", help="names of the frames to score, one a line")
@@ -510,6 +521,8 @@ def main(argv: Sequence[str] | None) -> None:
     args = parser.parse_args(argv)
     if args.plot and args.plot.suffix not in (".png", ".pdf", ".svg"):
         raise InputError(f"{args.plot}: not the name of a picture; let it end in .png, .pdf or .svg")
+    if args.score is not None and not math.isfinite(args.score):
+        raise InputError(f"--score {args.score}: want a finite number")
     levels = LEVELS_WITHOUT_2D if args.no_2d_filter else LEVELS
     if args.distance_bands:
         levels = distance_levels(args.distance_bands)
@@ -519,7 +532,9 @@ def main(argv: Sequence[str] | None) -> None:
         labels, predictions, classes=args.classes, levels=levels, score_threshold=args.score, points=points
     )
     print(format_table(result))
-    print(f"\n{len(frames)} frames scored")
+    without = sum(not (args.predictions / f"{frame}.txt").is_file() for frame in frames)
+    empty = f", {without} of them without a result file, counted as empty" if without else ""
+    print(f"\n{len(frames)} frame{'s' * (len(frames) != 1)} scored{empty}")
     figures = {name: {key: scored[key] for key in scored if key != "curves"} for name, scored in result.items()}
     try:
         if args.json:

@@ -1,6 +1,7 @@
 """Training, from top to bottom: `python -m hvnet.train`. Without arguments it trains the demo on generated scenes."""
 
 import argparse
+import hashlib
 import json
 import math
 import os
@@ -8,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
@@ -18,10 +20,18 @@ from hvnet.cli import InputError, run_command
 from hvnet.config import Config, TrainConfig, config_to_dict, load_config
 from hvnet.data.augment import augment
 from hvnet.data.database import FILE_NAME, Database, build_database, read_database, write_database
-from hvnet.data.kitti import CLASSES, Frame, detections_to_labels, read_frame, read_split
+from hvnet.data.kitti import (
+    Frame,
+    detections_to_labels,
+    read_calibration,
+    read_frame,
+    read_labels,
+    read_points,
+    read_split,
+)
 from hvnet.data.synthetic import Options, generate
 from hvnet.draw import draw_bev
-from hvnet.evaluate import evaluate, format_table
+from hvnet.evaluate import CLASSES, evaluate, format_table
 from hvnet.model import HVNet, load_checkpoint, save_checkpoint, select_device
 
 DEMO = Path(__file__).resolve().parent.parent / "configs" / "demo.yaml"
@@ -38,14 +48,18 @@ class Batch(NamedTuple):
     sample: Tensor  # (N,) int64
     boxes: list[Tensor]  # (M_b, 7) each
     labels: list[Tensor]  # (M_b,) int64 each, index into the config's classes
+    notes: list[str]  # what is to be said of the frames' files, once
 
     def to(self, device: torch.device) -> "Batch":
         """The batch on a device."""
         boxes, labels = [b.to(device) for b in self.boxes], [at.to(device) for at in self.labels]
-        return Batch(self.points.to(device), self.sample.to(device), boxes, labels)
+        return Batch(self.points.to(device), self.sample.to(device), boxes, labels, self.notes)
 
 
-class TrainingFrames(Dataset[tuple[Tensor, Tensor, Tensor]]):
+Sample = tuple[Tensor, Tensor, Tensor, str]
+
+
+class TrainingFrames(Dataset[Sample]):
     """The frames of a split, augmented; item (epoch, k) depends on the seed, the epoch and k alone."""
 
     def __init__(self, root: Path, ids: list[str], config: Config, database: Database | None) -> None:
@@ -53,7 +67,7 @@ class TrainingFrames(Dataset[tuple[Tensor, Tensor, Tensor]]):
         self.classes = [entry.name for entry in config.head.classes]
         self.kept: dict[int, Frame] = {}
 
-    def __getitem__(self, item: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+    def __getitem__(self, item: tuple[int, int]) -> Sample:
         epoch, k = item
         frame = self.kept.get(k) or read_frame(self.root, self.ids[k])
         if self.config.train.workers == 0:  # read once; several workers would each keep all frames
@@ -65,7 +79,7 @@ class TrainingFrames(Dataset[tuple[Tensor, Tensor, Tensor]]):
         )
         low, high = boxes.new_tensor(self.config.encoder.point_range).view(2, 3)
         inside = ((boxes[:, :2] >= low[:2]) & (boxes[:, :2] < high[:2])).all(dim=1) & (labels >= 0)
-        return points, boxes[inside], labels[inside]
+        return points, boxes[inside], labels[inside], note(frame)
 
 
 class EpochOrder(Sampler[tuple[int, int]]):
@@ -90,11 +104,24 @@ def seeded(*numbers: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def collate(samples: Sequence[tuple[Tensor, Tensor, Tensor]]) -> Batch:
+def note(frame: Frame) -> str:
+    """What a user should know of a frame's points; empty if nothing."""
+    return f"frame {frame.id}: {frame.dropped} points that are not finite were dropped" if frame.dropped else ""
+
+
+def say_once(notes: list[str], said: set[str]) -> None:
+    """Prints the notes that were not said before."""
+    for text in notes:
+        if text and text not in said:
+            said.add(text)
+            tqdm.write(text)
+
+
+def collate(samples: Sequence[Sample]) -> Batch:
     """Joins samples into a batch."""
-    points, boxes, labels = zip(*samples, strict=True)
+    points, boxes, labels, notes = zip(*samples, strict=True)
     sample = torch.repeat_interleave(torch.arange(len(points)), torch.tensor([len(p) for p in points]))
-    return Batch(torch.cat(points), sample, list(boxes), list(labels))
+    return Batch(torch.cat(points), sample, list(boxes), list(labels), list(notes))
 
 
 def learning_rate(config: TrainConfig, step: int, epoch: int) -> float:
@@ -114,9 +141,10 @@ def read_batches(loader: DataLoader) -> Iterator[Batch]:
 
 
 def train_epoch(
-    model: HVNet, optimizer: torch.optim.Optimizer, loader: DataLoader, epoch: int, step: int, device: torch.device
+    model: HVNet, optimizer: torch.optim.Optimizer, loader: DataLoader, epoch: int, step: int, said: set[str]
 ) -> tuple[dict[str, float], int]:
     """One epoch from a step on; returns the mean of every loss and the step that comes next."""
+    device = next(model.parameters()).device
     config = model.config.train
     model.train()
     sums: dict[str, Tensor] = {}
@@ -126,6 +154,7 @@ def train_epoch(
     for batch in bar:
         for group in optimizer.param_groups:
             group["lr"] = learning_rate(config, step, epoch)
+        say_once(batch.notes, said)
         batch = batch.to(device)
         terms = model.loss(model(batch.points, batch.sample, len(batch.boxes)), batch.boxes, batch.labels)
         loss = torch.stack(list(terms.values())).sum()
@@ -143,15 +172,15 @@ def train_epoch(
     return {name: total.item() / count for name, total in sums.items()}, step
 
 
-def validate(
-    model: HVNet, root: Path, ids: list[str], device: torch.device, pictures: Path
-) -> dict[str, dict[str, Any]]:
+def validate(model: HVNet, root: Path, ids: list[str], pictures: Path, said: set[str]) -> dict[str, dict[str, Any]]:
     """Detects in the frames of a split and scores the boxes as KITTI does; draws the first few into a folder."""
+    device = next(model.parameters()).device
     classes = [entry.name for entry in model.config.head.classes]
     model.eval()
     labels, predictions = [], []
     for k, name in enumerate(tqdm(ids, desc="validating", unit="frame", leave=False, dynamic_ncols=True)):
         frame = read_frame(root, name)
+        say_once([note(frame)], said)
         points = frame.points.to(device)
         sample = torch.zeros(len(points), dtype=torch.int64, device=device)
         found = model.detect(points, sample, 1)[0]
@@ -170,7 +199,9 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
     make_deterministic(config.train.seed)
     train_ids = read_split(root, config.train.train_split)
     val_ids = read_split(root, config.train.val_split)
-    database = load_database(root, config) if config.augment.objects else None
+    for name in tqdm([*train_ids, *val_ids], desc="checking", unit="frame", leave=False, dynamic_ncols=True):
+        check_frame(root, name)
+    database = load_database(root, config, val_ids) if config.augment.objects else None
     order = EpochOrder(len(train_ids), config.train.seed)
     loader: DataLoader = DataLoader(
         TrainingFrames(root, train_ids, config, database),
@@ -187,24 +218,26 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
     optimizer = torch.optim.Adam(
         model.parameters(), lr=config.train.learning_rate, weight_decay=config.train.weight_decay
     )
-    first_epoch, step = restore(out / "checkpoint.pt", model, optimizer) if resume else (0, 0)
+    frames = hashlib.sha256(json.dumps([train_ids, val_ids]).encode()).hexdigest()
+    first_epoch, step = restore(out / "checkpoint.pt", model, optimizer, frames) if resume else (0, 0)
     print(f"{len(train_ids)} frames to train, {len(val_ids)} to validate, on {device}; the run is {out}", flush=True)
 
     out.mkdir(parents=True, exist_ok=True)
     metrics = keep_metrics(out / "metrics.jsonl", first_epoch)
     board = SummaryWriter(str(out / "tensorboard"), purge_step=first_epoch + 1)
     if not resume:
-        save_run(out, model, optimizer, 0, 0)  # so that a run which fails in its first epoch can be resumed
+        save_run(out, model, optimizer, frames, 0, 0)  # so that a run which fails in its first epoch can be resumed
+    said: set[str] = set()
     for epoch in range(first_epoch, config.train.epochs):
         order.epoch = epoch
-        losses, step = train_epoch(model, optimizer, loader, epoch, step, device)
+        losses, step = train_epoch(model, optimizer, loader, epoch, step, said)
         print(
             f"epoch {epoch + 1:3d}  " + "  ".join(f"{name} {value:.6f}" for name, value in losses.items()), flush=True
         )
         record: dict[str, Any] = {"epoch": epoch + 1, "step": step, **losses}
         last = epoch + 1 == config.train.epochs
         if last or (epoch + 1) % config.train.validate_every == 0:
-            scores = validate(model, root, val_ids, device, out / "pictures")
+            scores = validate(model, root, val_ids, out / "pictures", said)
             print(format_table(scores), flush=True)
             record["validation"] = {
                 name: {measure: table[measure] for measure in ("R40", "exact")} for name, table in scores.items()
@@ -214,21 +247,39 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
         board.flush()
         with metrics.open("a", encoding="utf-8") as file:
             file.write(json.dumps(record) + "\n")
-        save_run(out, model, optimizer, epoch + 1, step)
+        save_run(out, model, optimizer, frames, epoch + 1, step)
     board.close()
     print(f"checkpoint: {out / 'checkpoint.pt'}\npictures:   {out / 'pictures'}")
 
 
-def load_database(root: Path, config: Config) -> Database:
-    """The root's ground-truth database; it is built, and kept there if that can be written, where there is none."""
+def check_frame(root: Path, name: str) -> None:
+    """Reads the small files of a frame, so that a mistake in one of them is found now and not epochs later."""
+    folder = root / "training"
+    read_calibration(folder / "calib" / f"{name}.txt")
+    read_labels(folder / "label_2" / f"{name}.txt")
+    points = folder / "velodyne" / f"{name}.bin"
+    if points.stat().st_size % 16:
+        read_points(points)  # which says what is wrong
+
+
+def load_database(root: Path, config: Config, val_ids: list[str]) -> Database:
+    """The root's ground-truth database without objects of validation frames.
+
+    Where there is none it is built, and kept in the root if that can be written.
+    """
     path = root / FILE_NAME
     if path.is_file():
-        return read_database(path)
-    database = build_database(root, config.train.train_split)
-    try:
-        write_database(path, database)
-    except OSError as error:
-        print(f"{path}: not kept ({error.strerror}); it will be built again")
+        database = read_database(path)
+    else:
+        database = build_database(root, config.train.train_split)
+        try:
+            write_database(path, database)
+        except OSError as error:
+            print(f"{path}: not kept ({error.strerror}); it will be built again")
+    leaked = np.isin(database.frame, [int(name) for name in val_ids if name.isdecimal()])
+    if leaked.any():
+        print(f"{path}: {int(leaked.sum())} objects of validation frames are left out")
+        database = database.select(~leaked)
     return database
 
 
@@ -241,12 +292,13 @@ def make_deterministic(seed: int) -> None:
     torch.backends.cudnn.benchmark = False
 
 
-def save_run(out: Path, model: HVNet, optimizer: torch.optim.Optimizer, epochs: int, steps: int) -> None:
+def save_run(out: Path, model: HVNet, optimizer: torch.optim.Optimizer, frames: str, epochs: int, steps: int) -> None:
     """Writes checkpoint.pt: all that a run needs to go on after so many epochs and steps."""
     content = {
         "config": config_to_dict(model.config),
         "model": model.state_dict(),
         "optimizer": optimizer.state_dict(),
+        "frames": frames,
         "epoch": epochs,
         "step": steps,
         "random": torch.get_rng_state(),
@@ -254,7 +306,7 @@ def save_run(out: Path, model: HVNet, optimizer: torch.optim.Optimizer, epochs: 
     save_checkpoint(out / "checkpoint.pt", content)
 
 
-def restore(path: Path, model: HVNet, optimizer: torch.optim.Optimizer) -> tuple[int, int]:
+def restore(path: Path, model: HVNet, optimizer: torch.optim.Optimizer, frames: str) -> tuple[int, int]:
     """Takes up a run where its checkpoint left it; returns the epochs and steps done."""
     content = load_checkpoint(path)
     here = config_to_dict(model.config)
@@ -262,6 +314,8 @@ def restore(path: Path, model: HVNet, optimizer: torch.optim.Optimizer) -> tuple
     changed = [key for key in changed if key not in CHANGEABLE]
     if changed:
         raise InputError(f"{path}: was trained with another {changed[0]}; give its config, or another --out")
+    if content.get("frames") != frames:
+        raise InputError(f"{path}: was trained on other frames; give its --data, or another --out")
     try:
         model.load_state_dict(content["model"])
         optimizer.load_state_dict(content["optimizer"])
@@ -319,7 +373,8 @@ def main(arguments: Sequence[str] | None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(
         prog="python -m hvnet.train",
-        description="Trains HVNet, validates it as KITTI does, and writes a checkpoint, metrics and pictures.",
+        description="Trains HVNet, validates it as KITTI does, and writes checkpoint.pt, metrics.jsonl, tensorboard/"
+        " and pictures/ to the run's folder.",
         epilog="examples:\n  python -m hvnet.train\n"
         "  python -m hvnet.train --config configs/compact.yaml --data /data/kitti --set train.batch_size=2\n"
         "  python -m hvnet.train --out runs/demo --resume",
@@ -330,7 +385,13 @@ def main(arguments: Sequence[str] | None) -> None:
     parser.add_argument("--out", metavar="DIR", help="folder of the run (default: runs/NAME of the config)")
     parser.add_argument("--resume", action="store_true", help="go on with the run in --out (default: the latest)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override a config value")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="override a config value, such as train.epochs=3",
+    )
     options = parser.parse_args(arguments)
 
     config = load_config(options.config, options.set)

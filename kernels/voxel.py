@@ -154,7 +154,7 @@ def _(points: Tensor, sample: Tensor, batch_size: int, flat: Sequence[float]) ->
 def _grids(flat: Sequence[float]) -> list[Grid]:
     """The grids whose ten numbers stand in a row."""
     rows = [flat[k : k + 10] for k in range(0, len(flat), 10)]
-    return [Grid(*row[:4], (row[4], row[5]), (int(row[6]), int(row[7])), (int(row[8]), int(row[9]))) for row in rows]
+    return [Grid(r[0], r[1], r[2], r[3], (r[4], r[5]), (int(r[6]), int(r[7])), (int(r[8]), int(r[9]))) for r in rows]
 
 
 def is_nested(grids: Sequence[Grid], batch_size: int) -> bool:

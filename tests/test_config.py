@@ -111,6 +111,7 @@ def test_whole_numbers_are_numbers(tree: dict[str, Any]) -> None:
         ("train", None, "train", "want a mapping with the keys epochs"),
         ("train", [1], "train", "want a mapping"),
         ("encoder.voxel_size", 0.4, "encoder.voxel_size", "want a list, got 0.4"),
+        ("encoder.voxel_size", [1.0e-6, 0.1], "encoder.voxel_size", "want at most 67108864 cells in the finest"),
         ("encoder.voxel_size", "0.4", "encoder.voxel_size", "want a list"),
         ("encoder.voxel_size", [0.4], "encoder.voxel_size", "want a list of 2"),
         ("encoder.voxel_size", [0.4, "x"], "encoder.voxel_size[1]", "want a number"),

@@ -339,11 +339,11 @@ def test_frame_without_result_file(folders: list[str], tmp_path: Path, capsys: p
     with pytest.raises(InputError, match=r"no result file for 1 of 2 frames, the first is 000007\.txt.*--frames"):
         main(folders)
     main([*folders, "--missing-as-empty"])
-    assert "2 frames scored" in capsys.readouterr().out
+    assert "2 frames scored, 1 of them without a result file, counted as empty\n" in capsys.readouterr().out
     frames = tmp_path / "frames.txt"
     frames.write_text("000003\n\n")
     main([*folders, "--frames", str(frames)])
-    assert "1 frames scored" in capsys.readouterr().out
+    assert "1 frame scored\n" in capsys.readouterr().out
 
 
 def test_missing_as_empty_counts_the_ground_truths(folders: list[str], tmp_path: Path):
@@ -388,6 +388,8 @@ def test_wrong_folders_and_outputs(folders: list[str], tmp_path: Path):
         main([*folders[:2], "--predictions", str(tmp_path / "empty")])
     with pytest.raises(InputError, match=r"curve\.gif: not the name of a picture"):
         main([*folders, "--plot", "curve.gif"])
+    with pytest.raises(InputError, match="--score nan: want a finite number"):
+        main([*folders, "--score", "nan"])
     with pytest.raises(InputError, match="cannot be written"):
         main([*folders, "--json", str(tmp_path / "none" / "a.json")])
     with pytest.raises(SystemExit):

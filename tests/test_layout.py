@@ -44,7 +44,7 @@ ALLOWED = {f"kernels.{name}": allowed for name, allowed in KERNELS.items()} | {
     "matching": ANY_KERNEL | {"boxes", "data.kitti"},
     "evaluate": {"boxes", "matching", "data.kitti"},
     "train": NETWORK | DATA | {"model", "draw", "evaluate"},
-    "detect": NETWORK | DATA | {"model", "draw"},
+    "detect": NETWORK | DATA | {"model", "draw", "evaluate"},
 }
 
 

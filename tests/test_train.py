@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -19,7 +20,8 @@ from torch.utils.data import DataLoader
 
 from hvnet.cli import InputError
 from hvnet.config import Config, TrainConfig, load_config
-from hvnet.data.kitti import CLASSES
+from hvnet.data.database import build_database, object_points, write_database
+from hvnet.evaluate import CLASSES
 from hvnet.model import load, load_checkpoint, save_checkpoint
 from hvnet.train import (
     EpochOrder,
@@ -334,6 +336,8 @@ def test_mistakes_in_the_arguments(scenes: Path, tmp_path: Path) -> None:
         run(None, tmp_path / "out", "synthetic=null")
     with pytest.raises(InputError, match=r"demo\.yaml: head\.classes\[0\]\.name: unknown class 'Boat'; known are Car"):
         run(scenes, tmp_path / "out", "augment.objects={}", f"head.classes=[{_entry('Boat')}]")
+    with pytest.raises(InputError, match=r"unknown class 'Van'; known are Car, Pedestrian, Cyclist"):  # is not scored
+        run(scenes, tmp_path / "out", "augment.objects={}", f"head.classes=[{_entry('Van')}]")
     with pytest.raises(InputError, match=r"train\.epoch: unknown key"):
         run(scenes, tmp_path / "out", "train.epoch=3")
     with pytest.raises(InputError, match=r"none\.txt: no such file"):
@@ -390,6 +394,46 @@ def test_no_object_in_any_frame(copied: Path, tmp_path: Path) -> None:
 # --- the parts --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("workers", [0, 1])
+def test_points_that_are_not_finite_are_said_once(copied: Path, tmp_path: Path, workers: int) -> None:
+    """Two epochs with two validations read each frame again and again."""
+    for name in ("000001", "000005"):  # of the training and of the validation split
+        path = copied / "training" / "velodyne" / f"{name}.bin"
+        points = np.fromfile(path, dtype=np.float32).reshape(-1, 4)
+        points[:7, 1] = np.nan
+        points.tofile(path)
+    printed = run(copied, tmp_path / "run", f"train.workers={workers}")
+    for name in ("000001", "000005"):
+        assert printed.count(f"frame {name}: 7 points that are not finite were dropped") == 1
+
+
+def test_a_mistake_in_a_validation_file_is_found_before_the_first_epoch(copied: Path, tmp_path: Path) -> None:
+    label = copied / "training" / "label_2" / "000005.txt"
+    label.write_text(label.read_text() + "Car 1 2 3\n")
+    with pytest.raises(InputError, match=r"000005\.txt:\d+: "):
+        run(copied, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_other_frames_are_not_resumed(copied: Path, begun: Path) -> None:
+    (copied / "ImageSets" / "train.txt").write_text("000000\n000001\n000002\n")
+    with pytest.raises(InputError, match="was trained on other frames"):
+        run(copied, begun, resume=True)
+
+
+def test_objects_of_validation_frames_are_left_out(copied: Path, tiny: Config, capsys: pytest.CaptureFixture) -> None:
+    every = build_database(copied, "train")
+    write_database(copied / "gt_database.npz", every)
+    database = load_database(copied, tiny, ["000001", "000003"])
+    assert set(database.frame.tolist()) == set(every.frame.tolist()) - {1, 3}
+    dropped = len(every) - len(database)
+    assert 0 < dropped < len(every)
+    assert f"{dropped} objects of validation frames are left out" in capsys.readouterr().out
+    kept = np.flatnonzero(~np.isin(every.frame, [1, 3]))
+    for k, of_all in enumerate(kept):
+        assert torch.equal(object_points(database, k), object_points(every, of_all))
+
+
 def test_learning_rate() -> None:
     config = TrainConfig(learning_rate=3.0, warmup_steps=10, warmup_ratio=1 / 3, decay_epochs=(4, 6), decay_ratio=0.1)
     table = [(0, 0, 1.0), (5, 0, 2.0), (9, 0, 2.8), (10, 0, 3.0), (99, 3, 3.0), (100, 4, 0.3), (150, 5, 0.3),
@@ -401,7 +445,7 @@ def test_learning_rate() -> None:
 
 def test_an_item_depends_on_seed_epoch_and_number_alone(scenes: Path, tiny: Config) -> None:
     ids = ["000000", "000001", "000002"]
-    database = load_database(scenes, tiny)
+    database = load_database(scenes, tiny, [])
 
     def frames(seed: int = 0) -> TrainingFrames:
         return TrainingFrames(
@@ -461,7 +505,7 @@ def test_batches_hold_whole_frames(scenes: Path, tiny: Config) -> None:
     frames = TrainingFrames(scenes, ["000000", "000001", "000002"], config, None)
     (batch,) = DataLoader(frames, batch_size=3, sampler=items, collate_fn=collate)  # type: ignore[arg-type]
     for b, item in enumerate(items):
-        points, boxes, labels = frames[item]
+        points, boxes, labels, _ = frames[item]
         assert torch.equal(batch.points[batch.sample == b], points)
         assert torch.equal(batch.boxes[b], boxes)
         assert torch.equal(batch.labels[b], labels)

@@ -46,6 +46,14 @@ class Database:
     def __len__(self) -> int:
         return len(self.name)
 
+    def select(self, objects: NDArray[np.bool_]) -> "Database":
+        """The objects (K,) that are marked, and their points."""
+        lengths = np.diff(self.offsets)
+        points = np.repeat(objects, lengths)
+        rows = {name: getattr(self, name)[objects] for name, (shape, _) in LAYOUT.items() if shape[0] == "K"}
+        offsets = np.concatenate((np.zeros(1, np.int64), np.cumsum(lengths[objects])))
+        return Database(self.xyz_mm[:, points], self.reflectance[points], offsets, **rows)
+
 
 # K objects, M points; the length of a name is free
 LAYOUT = {
