@@ -107,14 +107,17 @@ class AttentiveVFE(nn.Module):
         self.relu = relu
 
     def forward(
-        self, features: Tensor, points: Tensor, voxels: list[ScaleOfPoints], keep: bool
+        self, features: Tensor, norm: Tensor, points: Tensor, voxels: list[ScaleOfPoints], keep: bool
     ) -> list[tuple[Tensor, Tensor]]:
-        """BN(Linear(features)) (N, q) of points (N, d) to M (N, q), if to be kept, and G' (V, q) of every scale."""
+        """Linear(features) (N, q), scale and shift of its batch norm (2, q), points (N, d): M and G' of every scale.
+
+        M is (N, q), or (0, q) unless it is to be kept, G' (V, q).
+        """
         of_rows = None
         if self.training and points.shape[0] > 1:
             of_rows = torch.stack([scale.moments for scale in voxels]).sum(dim=0)
-        weight = folded(self.knowledge, self.knowledge_norm, of_rows)
-        return [attend(features, points, scale.mean, weight, scale.segments, self.relu, keep) for scale in voxels]
+        layer = torch.vstack((folded(self.knowledge, self.knowledge_norm, of_rows), norm))
+        return [attend(features, points, scale.mean, layer, scale.segments, self.relu, keep) for scale in voxels]
 
 
 class HybridVoxelEncoder(nn.Module):
@@ -145,10 +148,12 @@ class HybridVoxelEncoder(nn.Module):
         of_rows = moments(torch.cat((points, ones), dim=1)) if self.training and points.shape[0] > 1 else None
         weight = folded(self.avfe.features, self.avfe.features_norm, of_rows)
         at = [scales[grid] for grid in self.feature_grids]
-        encoded = self.avfe(torch.addmm(weight[-1], points, weight[:-1]), points, at, keep=True)
-        context = batch_norm(self.avfeo.features_norm, self.linear_of_context(encoded, at))
+        features = torch.addmm(weight[-1], points, weight[:-1])
+        as_it_is = torch.vstack((torch.ones_like(weight[-1]), torch.zeros_like(weight[-1])))
+        encoded = self.avfe(features, as_it_is, points, at, keep=True)
+        context = self.linear_of_context(encoded, at)
         at = [scales[grid] for grid in self.projection_grids]
-        projected = self.avfeo(context, points, at, keep=False)
+        projected = self.avfeo(context, batch_norm(self.avfeo.features_norm, context), points, at, keep=False)
         return [
             project(maxima, scale.cursor, grid, batch_size)
             for (_, maxima), scale, grid in zip(projected, at, self.projection_grids, strict=True)
@@ -170,7 +175,7 @@ def scale_of_points(points: Tensor, voxels: Voxels) -> ScaleOfPoints:
 
 
 def batch_norm(norm: nn.BatchNorm1d, rows: Tensor) -> Tensor:
-    """Batch norm of rows (N, C), whose sums do not depend on the number of threads as torch's do.
+    """Scale and shift (2, C) of the batch norm of rows (N, C), from sums that no number of threads changes.
 
     A batch of fewer than two rows has no variance and takes the running one.
     """
@@ -184,7 +189,7 @@ def batch_norm(norm: nn.BatchNorm1d, rows: Tensor) -> Tensor:
         mean = mean.to(rows.dtype)
         update_statistics(norm, mean.detach(), variance.detach() * (count / (count - 1)))
     scale = norm.weight * torch.rsqrt(variance + norm.eps)
-    return torch.addcmul(norm.bias - mean * scale, rows, scale)
+    return torch.vstack((scale, norm.bias - mean * scale))
 
 
 def project(features: Tensor, cursor: Tensor, grid: Grid, batch_size: int) -> Tensor:

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import torch
-import torch.nn.functional as F
 import warp as wp
 from torch import Tensor
 
@@ -19,30 +18,32 @@ from hvnet.kernels.scatter import Segments
 from hvnet.kernels.voxel import NestedIndex
 
 ROWS = 1024  # rows that are summed as one block
-KNOWLEDGE = 9  # rows of a weight: x - mean x (3), f, mean p (4), and the bias
+LAYER = 11  # rows of a layer: of g, x - mean x (3), f, mean p (4) and the bias; scale and shift of the features
+VOXELS = 32  # voxels whose gradient of the layer is summed as one block
 
 
 def attend(
     features: Tensor,
     points: Tensor,
     mean: Tensor,
-    weight: Tensor,
+    layer: Tensor,
     voxels: Segments,
     relu: bool = False,
     keep: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """M (N, C) and its maxima G' (V, C) for features (N, C) of points (N, 4) in voxels of means (V, 4).
 
-    The weight (9, C) holds the transposed W of g and, last, the bias b. With relu, features and attention go through a
-    ReLU before the product; unless M is to be kept, it is (0, C). A tie goes to the last point of the segment.
-    Gradients go to features and weight; the points are given. Raises TypeError or ValueError naming the argument.
+    The layer (11, C) holds the transposed W of g and its bias b (9 rows), and scale and shift of the features (their
+    batch norm). With relu, features and attention go through a ReLU before the product. M is (0, C) unless it is to be
+    kept. A tie goes to the last point of the segment. Gradients go to features and layer; the points are given. Raises
+    TypeError or ValueError naming the argument.
     """
     check_tensor("features", features, FLOATS, (None, None))
     count = features.shape[1]
     check_tensor("points", points, (features.dtype,), (features.shape[0], 4), like=features)
     check_tensor("mean", mean, (features.dtype,), (voxels.starts.shape[0] - 1, 4), like=features)
-    check_tensor("weight", weight, (features.dtype,), (KNOWLEDGE, count), like=features)
-    product, values, _ = _attend(features, points, mean, weight, voxels.voxel, voxels.order, voxels.starts, relu, keep)
+    check_tensor("layer", layer, (features.dtype,), (LAYER, count), like=features)
+    product, values, _ = _attend(features, points, mean, layer, voxels.voxel, voxels.order, voxels.starts, relu, keep)
     return product, values
 
 
@@ -177,13 +178,14 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         centre = mean[voxel]
         shared = of_voxel(weight, c, centre)
         w0, w1, w2, w3 = weight[0, c], weight[1, c], weight[2, c], weight[3, c]
+        scale, shift = weight[9, c], weight[10, c]
         best = vec()
         at = places(-1)
         start = int(starts[voxel])
         for k in range(start, int(starts[voxel + 1])):
             i = point_at(order, k)
             attention = shared + of_point(w0, w1, w2, w3, points[i], centre)
-            row = features[i, c]
+            row = wp.cw_mul(features[i, c], scale) + shift
             if relu != 0:
                 attention = wp.max(attention, vec())
                 row = wp.max(row, vec())
@@ -213,36 +215,69 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         argmax: wp.array2d(dtype=places),
         relu: int,
         grad_features: wp.array2d(dtype=vec),
-        grad_attention: wp.array2d(dtype=vec),
+        grad_weight: wp.array3d(dtype=vec),
     ):
-        voxel, c = wp.tid()
-        centre = mean[voxel]
-        shared = of_voxel(weight, c, centre)
+        """The gradient of the features, and for a block of voxels that of the layer: one loop, in a fixed order."""
+        block, c = wp.tid()
         w0, w1, w2, w3 = weight[0, c], weight[1, c], weight[2, c], weight[3, c]
-        given = grad_values[voxel, c]
-        at = argmax[voxel, c]
-        for k in range(int(starts[voxel]), int(starts[voxel + 1])):
-            i = point_at(order, k)
-            attention = shared + of_point(w0, w1, w2, w3, points[i], centre)
-            row = features[i, c]
-            taken = vec()
-            if grad_product.shape[0] > 0:
-                taken = grad_product[i, c]
-            for lane in range(lanes):
-                if at[lane] == i:
-                    taken[lane] = taken[lane] + given[lane]
-            to_features = taken
-            to_attention = taken
-            if relu != 0:
+        scale, shift = weight[9, c], weight[10, c]
+        g0, g1, g2, g3 = vec(), vec(), vec(), vec()
+        g4, g5, g6, g7, g8 = vec(), vec(), vec(), vec(), vec()
+        g9, g10 = vec(), vec()
+        for voxel in range(block * VOXELS, wp.min((block + 1) * VOXELS, mean.shape[0])):
+            centre = mean[voxel]
+            shared = of_voxel(weight, c, centre)
+            given = grad_values[voxel, c]
+            at = argmax[voxel, c]
+            total = vec()
+            for k in range(int(starts[voxel]), int(starts[voxel + 1])):
+                i = point_at(order, k)
+                p = points[i]
+                attention = shared + of_point(w0, w1, w2, w3, p, centre)
+                raw = features[i, c]
+                row = wp.cw_mul(raw, scale) + shift
+                taken = vec()
+                if grad_product.shape[0] > 0:
+                    taken = grad_product[i, c]
                 for lane in range(lanes):
-                    if not (row[lane] > zero):
-                        to_features[lane] = zero
-                    if not (attention[lane] > zero):
-                        to_attention[lane] = zero
-                row = wp.max(row, vec())
-                attention = wp.max(attention, vec())
-            grad_features[i, c] = wp.cw_mul(to_features, attention)
-            grad_attention[i, c] = wp.cw_mul(to_attention, row)
+                    if at[lane] == i:
+                        taken[lane] = taken[lane] + given[lane]
+                to_row = taken
+                to_attention = taken
+                if relu != 0:
+                    for lane in range(lanes):
+                        if not (row[lane] > zero):
+                            to_row[lane] = zero
+                        if not (attention[lane] > zero):
+                            to_attention[lane] = zero
+                    row = wp.max(row, vec())
+                    attention = wp.max(attention, vec())
+                to_row = wp.cw_mul(to_row, attention)
+                to_attention = wp.cw_mul(to_attention, row)
+                grad_features[i, c] = wp.cw_mul(to_row, scale)
+                g0 += (p[0] - centre[0]) * to_attention
+                g1 += (p[1] - centre[1]) * to_attention
+                g2 += (p[2] - centre[2]) * to_attention
+                g3 += p[3] * to_attention
+                total += to_attention
+                g9 += wp.cw_mul(to_row, raw)
+                g10 += to_row
+            g4 += centre[0] * total
+            g5 += centre[1] * total
+            g6 += centre[2] * total
+            g7 += centre[3] * total
+            g8 += total
+        grad_weight[block, 0, c] = g0
+        grad_weight[block, 1, c] = g1
+        grad_weight[block, 2, c] = g2
+        grad_weight[block, 3, c] = g3
+        grad_weight[block, 4, c] = g4
+        grad_weight[block, 5, c] = g5
+        grad_weight[block, 6, c] = g6
+        grad_weight[block, 7, c] = g7
+        grad_weight[block, 8, c] = g8
+        grad_weight[block, 9, c] = g9
+        grad_weight[block, 10, c] = g10
 
     @wp.kernel(enable_backward=False, module=module)
     def encode(
@@ -454,14 +489,15 @@ def _attend_backward(
     points: Tensor,
     mean: Tensor,
     weight: Tensor,
-    voxel: Tensor,
     order: Tensor | None,
     starts: Tensor,
     argmax: Tensor,
     relu: bool,
 ) -> tuple[Tensor, Tensor]:
     count, lanes = features.shape[1], lanes_of(features.shape[1])
-    grads = features.new_empty(features.shape), features.new_empty(features.shape)
+    blocks = -(-mean.shape[0] // VOXELS)
+    grad_features = features.new_empty(features.shape)
+    grad_weight = features.new_empty(blocks, LAYER, count)
     given = features.new_empty(0, count) if grad_product is None else grad_product.contiguous()
     inputs = [
         channels(given, lanes),
@@ -474,19 +510,11 @@ def _attend_backward(
         array(starts.contiguous()),
         channels(argmax, lanes),
         int(relu),
-        *(channels(grad, lanes) for grad in grads),
+        channels(grad_features, lanes),
+        array(grad_weight.view(blocks, LAYER, count // lanes, lanes), lanes),
     ]
-    kernel = _kernels(WARP_FLOAT[features.dtype], lanes).backward
-    launch(kernel, (mean.shape[0], count // lanes), inputs, features.device)
-    return grads[0], _product_of_columns(knowledge(points, mean, voxel), grads[1])
-
-
-def _product_of_columns(a: Tensor, b: Tensor) -> Tensor:
-    """a' b of a (N, k) and b (N, C) in blocks of fixed size: BLAS would split the long sum by the number of threads."""
-    blocks = max(1, -(-a.shape[0] // ROWS))
-    padding = (0, 0, 0, blocks * ROWS - a.shape[0])
-    a, b = (F.pad(matrix, padding).view(blocks, ROWS, matrix.shape[1]) for matrix in (a, b))
-    return torch.bmm(a.transpose(1, 2), b).sum(dim=0)
+    launch(_kernels(WARP_FLOAT[features.dtype], lanes).backward, (blocks, count // lanes), inputs, features.device)
+    return grad_features, grad_weight.sum(dim=0)
 
 
 @_attend_backward.register_fake
@@ -497,7 +525,6 @@ def _(
     points: Tensor,
     mean: Tensor,
     weight: Tensor,
-    voxel: Tensor,
     order: Tensor | None,
     starts: Tensor,
     argmax: Tensor,
@@ -514,12 +541,12 @@ def _save(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> Non
 
 
 def _backward(ctx: Any, grad_product: Tensor | None, grad_values: Tensor | None, _: Any) -> tuple[Tensor | None, ...]:
-    features, points, mean, weight, voxel, order, starts, argmax = ctx.saved_tensors
+    features, points, mean, weight, _, order, starts, argmax = ctx.saved_tensors
     if grad_values is None:
         grad_values = features.new_zeros(mean.shape[0], features.shape[1])
     given = grad_product if ctx.keep else None
     grad_features, grad_weight = _attend_backward(
-        given, grad_values, features, points, mean, weight, voxel, order, starts, argmax, ctx.relu
+        given, grad_values, features, points, mean, weight, order, starts, argmax, ctx.relu
     )
     return grad_features, None, None, grad_weight, None, None, None, None, None
 

@@ -149,16 +149,18 @@ def attend(
     features: Tensor,
     points: Tensor,
     mean: Tensor,
-    weight: Tensor,
+    layer: Tensor,
     voxels: Segments,
     relu: bool = False,
     keep: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """M (N, C) and its maxima (V, C): features (N, C) times the attention W g + b of points (N, 4) in their voxels.
 
-    The weight (9, C) is that of g = (x - mean x, f, mean p) of Eq. 2 and, last, the bias; see encode.attend.
+    The layer (11, C) is that of g = (x - mean x, f, mean p) of Eq. 2, its bias, and the scale and shift of the
+    features; see encode.attend.
     """
-    attention = knowledge(points, mean, voxels.voxel) @ weight
+    attention = knowledge(points, mean, voxels.voxel) @ layer[:9]
+    features = features * layer[9] + layer[10]
     if relu:
         features, attention = features.relu(), attention.relu()
     product = features * attention

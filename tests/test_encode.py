@@ -11,17 +11,17 @@ from hvnet.kernels.voxel import hash_index
 
 
 def case(count: int, voxels: int, channels: int, dtype: torch.dtype, device: torch.device, ordered: bool) -> tuple:
-    """Features, points, means, weight and segments of random points; with ordered, the points stand by voxel."""
+    """Features, points, means, layer and segments of random points; with ordered, the points stand by voxel."""
     generator = torch.Generator().manual_seed(count + channels)
     index = torch.randint(voxels, (count,), generator=generator)
     if ordered:
         index = index.sort().values
     points = torch.rand(count, 4, generator=generator, dtype=dtype) * 4 - 2
     features = torch.randn(count, channels, generator=generator, dtype=dtype)
-    weight = torch.randn(9, channels, generator=generator, dtype=dtype)
+    layer = torch.randn(11, channels, generator=generator, dtype=dtype)
     at = segments(index.to(device), voxels)
     mean = scatter_mean(points.to(device), index.to(device), voxels)
-    return features.to(device), points.to(device), mean, weight.to(device), at._replace(order=None) if ordered else at
+    return features.to(device), points.to(device), mean, layer.to(device), at._replace(order=None) if ordered else at
 
 
 @pytest.mark.parametrize("relu", [True, False])
@@ -32,16 +32,16 @@ def case(count: int, voxels: int, channels: int, dtype: torch.dtype, device: tor
 def test_values_and_gradients(
     count: int, voxels: int, channels: int, relu: bool, ordered: bool, device: torch.device
 ) -> None:
-    features, points, mean, weight, at = case(count, voxels, channels, torch.float64, device, ordered)
+    features, points, mean, layer, at = case(count, voxels, channels, torch.float64, device, ordered)
     results = []
     for function in (attend, reference.attend):
-        inputs = features.clone().requires_grad_(), weight.clone().requires_grad_()
+        inputs = features.clone().requires_grad_(), layer.clone().requires_grad_()
         product, values = function(inputs[0], points, mean, inputs[1], at, relu)
         loss = (product * product.detach().cos()).sum() + (values * values.detach().sin()).sum()
         results.append((product, values, *torch.autograd.grad(loss, inputs, allow_unused=True)))
     for got, want in zip(*results, strict=True):
         torch.testing.assert_close(got, want, rtol=1e-12, atol=1e-12)
-    without, same = attend(features, points, mean, weight, at, relu, keep=False)
+    without, same = attend(features, points, mean, layer, at, relu, keep=False)
     assert without.shape == (0, channels)
     assert torch.equal(same, results[0][1])
 
@@ -49,19 +49,19 @@ def test_values_and_gradients(
 @pytest.mark.parametrize("relu", [True, False])
 @pytest.mark.parametrize("keep", [True, False])
 def test_gradcheck(relu: bool, keep: bool, device: torch.device) -> None:
-    features, points, mean, weight, at = case(12, 5, 3, torch.float64, device, ordered=False)
+    features, points, mean, layer, at = case(12, 5, 3, torch.float64, device, ordered=False)
 
-    def outputs(features: Tensor, weight: Tensor) -> tuple[Tensor, ...]:
-        product, values = attend(features, points, mean, weight, at, relu, keep)
+    def outputs(features: Tensor, layer: Tensor) -> tuple[Tensor, ...]:
+        product, values = attend(features, points, mean, layer, at, relu, keep)
         return (product, values) if keep else (values,)
 
-    assert torch.autograd.gradcheck(outputs, (features.requires_grad_(), weight.requires_grad_()))
+    assert torch.autograd.gradcheck(outputs, (features.requires_grad_(), layer.requires_grad_()))
 
 
 def test_float32_is_near_float64(device: torch.device) -> None:
-    features, points, mean, weight, at = case(500, 90, 64, torch.float64, device, ordered=True)
-    want = attend(features, points, mean, weight, at)
-    got = attend(features.float(), points.float(), mean.float(), weight.float(), at)
+    features, points, mean, layer, at = case(500, 90, 64, torch.float64, device, ordered=True)
+    want = attend(features, points, mean, layer, at)
+    got = attend(features.float(), points.float(), mean.float(), layer.float(), at)
     for a, b in zip(got, want, strict=True):
         torch.testing.assert_close(a.double(), b, rtol=1e-5, atol=1e-5)  # nine products of numbers up to 4
 
@@ -71,9 +71,10 @@ def test_a_tie_goes_to_the_last_point(device: torch.device) -> None:
     points = torch.tensor([[1.0, 2.0, 3.0, 0.5]], device=device).repeat(3, 1)
     at = segments(torch.zeros(3, dtype=torch.int64, device=device), 1)
     features = torch.full((3, 2), 2.0, device=device, requires_grad=True)
-    weight = torch.zeros(9, 2, device=device)
-    weight[8] = torch.tensor([1.5, -1.5])
-    product, values = attend(features, points, points[:1], weight, at)
+    layer = torch.zeros(11, 2, device=device)
+    layer[8] = torch.tensor([1.5, -1.5])
+    layer[9] = 1
+    product, values = attend(features, points, points[:1], layer, at)
     assert product.tolist() == [[3.0, -3.0]] * 3
     assert values.tolist() == [[3.0, -3.0]]
     (grad,) = torch.autograd.grad(values.sum(), features)
@@ -105,33 +106,33 @@ def test_knowledge_by_hand(device: torch.device) -> None:
 
 
 def test_same_bits_twice(device: torch.device) -> None:
-    features, points, mean, weight, at = case(3000, 200, 64, torch.float32, device, ordered=False)
+    features, points, mean, layer, at = case(3000, 200, 64, torch.float32, device, ordered=False)
     runs = []
     for _ in range(2):
-        inputs = features.clone().requires_grad_(), weight.clone().requires_grad_()
+        inputs = features.clone().requires_grad_(), layer.clone().requires_grad_()
         product, values = attend(inputs[0], points, mean, inputs[1], at)
         runs.append((product, values, *torch.autograd.grad(product.sum() + values.square().sum(), inputs)))
     assert all(torch.equal(a, b) for a, b in zip(*runs, strict=True))
 
 
 def test_bad_arguments() -> None:
-    features, points, mean, weight, at = case(6, 3, 4, torch.float32, torch.device("cpu"), ordered=False)
+    features, points, mean, layer, at = case(6, 3, 4, torch.float32, torch.device("cpu"), ordered=False)
     with pytest.raises(TypeError, match=r"features: want a torch\.Tensor, got list"):
-        attend([1.0], points, mean, weight, at)  # type: ignore[arg-type]
+        attend([1.0], points, mean, layer, at)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match=r"points: want dtype torch\.float32, got torch\.float64"):
-        attend(features, points.double(), mean, weight, at)
+        attend(features, points.double(), mean, layer, at)
     with pytest.raises(ValueError, match=r"points: want shape \(6, 4\), got \(5, 4\)"):
-        attend(features, points[:5], mean, weight, at)
+        attend(features, points[:5], mean, layer, at)
     with pytest.raises(ValueError, match=r"mean: want shape \(3, 4\), got \(2, 4\)"):
-        attend(features, points, mean[:2], weight, at)
-    with pytest.raises(ValueError, match=r"weight: want shape \(9, 4\), got \(8, 4\)"):
-        attend(features, points, mean, weight[:8], at)
+        attend(features, points, mean[:2], layer, at)
+    with pytest.raises(ValueError, match=r"layer: want shape \(11, 4\), got \(8, 4\)"):
+        attend(features, points, mean, layer[:8], at)
 
 
 def test_opcheck() -> None:
     """torch.library's own checks of the ops: schema, fake tensors, autograd registration, compilation."""
-    features, points, mean, weight, at = case(20, 6, 16, torch.float32, torch.device("cpu"), ordered=False)
-    inputs = (features.requires_grad_(), points, mean, weight.requires_grad_(), at.voxel, at.order, at.starts)
+    features, points, mean, layer, at = case(20, 6, 16, torch.float32, torch.device("cpu"), ordered=False)
+    inputs = (features.requires_grad_(), points, mean, layer.requires_grad_(), at.voxel, at.order, at.starts)
     for order in (at.order, None):
         voxel = at.voxel if order is not None else at.voxel.sort().values
         torch.library.opcheck(torch.ops.hvnet.attend, (*inputs[:4], voxel, order, at.starts, False, True))
