@@ -135,6 +135,15 @@ def _kernels(dtype: Any) -> SimpleNamespace:
         mask[i, word] = bits
 
     @wp.kernel(enable_backward=False, module=module)
+    def nms_greedy(boxes: wp.array2d(dtype=dtype), threshold: dtype, keep: wp.array(dtype=wp.bool)):
+        """One thread goes through the boxes from the best on; each that is kept drops those that it overlaps."""
+        for i in range(boxes.shape[0]):
+            if keep[i]:
+                for j in range(i + 1, boxes.shape[0]):
+                    if keep[j] and iou_bev(boxes, i, boxes, j) > threshold:
+                        keep[j] = False
+
+    @wp.kernel(enable_backward=False, module=module)
     def match(
         anchors: wp.array2d(dtype=dtype),
         boxes: wp.array2d(dtype=dtype),
@@ -158,7 +167,9 @@ def _kernels(dtype: Any) -> SimpleNamespace:
         iou[sample, i] = highest
         box[sample, i] = wp.int64(at)
 
-    return SimpleNamespace(matrix_bev=matrix_bev, matrix_3d=matrix_3d, pairs=pairs, nms_mask=nms_mask, match=match)
+    return SimpleNamespace(
+        matrix_bev=matrix_bev, matrix_3d=matrix_3d, pairs=pairs, nms_mask=nms_mask, nms_greedy=nms_greedy, match=match
+    )
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -203,14 +214,18 @@ def rotated_nms(boxes: Tensor, scores: Tensor, iou_threshold: float) -> Tensor:
     check_tensor("boxes", boxes, FLOATS, (None, 7))
     check_tensor("scores", scores, FLOATS, (len(boxes),), like=boxes)
     order = torch.sort(scores, descending=True, stable=True).indices
-    count, words = len(boxes), -(-len(boxes) // WORD)
-    mask = torch.empty(count, words, dtype=torch.int64, device=boxes.device)
-    removed = torch.zeros(words, dtype=torch.int64, device=boxes.device)
-    keep = torch.empty(count, dtype=torch.bool, device=boxes.device)
+    keep = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
     dtype = WARP_FLOAT[boxes.dtype]
-    inputs = [array(boxes[order].contiguous()), dtype(iou_threshold), array(mask)]
-    launch(_kernels(dtype).nms_mask, (count, words), inputs, boxes.device)
-    launch(_nms_sweep, 1, [array(mask), array(removed), array(keep)], boxes.device)
+    ranked = array(boxes[order].contiguous())
+    if boxes.device.type == "cpu":  # one thread compares only boxes that are still there
+        launch(_kernels(dtype).nms_greedy, 1, [ranked, dtype(iou_threshold), array(keep)], boxes.device)
+    else:  # many threads compare all pairs into a mask of bits, one thread sweeps it
+        words = -(-len(boxes) // WORD)
+        mask = torch.empty(len(boxes), words, dtype=torch.int64, device=boxes.device)
+        removed = torch.zeros(words, dtype=torch.int64, device=boxes.device)
+        inputs = [ranked, dtype(iou_threshold), array(mask)]
+        launch(_kernels(dtype).nms_mask, (len(boxes), words), inputs, boxes.device)
+        launch(_nms_sweep, 1, [array(mask), array(removed), array(keep)], boxes.device)
     return order[keep]
 
 
