@@ -143,21 +143,29 @@ class HybridVoxelEncoder(nn.Module):
         index = voxel_index(points, sample, batch_size, grids)
         points = points[index.order]
         scales = {grid: scale_of_points(points, voxels) for grid, voxels in zip(grids, index.scales, strict=True)}
+        projected = self.voxel_features(self.point_features(points, scales), points, scales)
+        return [
+            write_image(maxima, scales[grid].cursor, grid, batch_size)
+            for maxima, grid in zip(projected, self.projection_grids, strict=True)
+        ]
 
+    def point_features(self, points: Tensor, scales: dict[Grid, ScaleOfPoints]) -> list[tuple[Tensor, Tensor]]:
+        """AVFE: points (N, d) to M (N, q) and G' (V, q) of every feature scale."""
         ones = torch.ones_like(points[:, :1])
         of_rows = moments(torch.cat((points, ones), dim=1)) if self.training and points.shape[0] > 1 else None
         weight = folded(self.avfe.features, self.avfe.features_norm, of_rows)
-        at = [scales[grid] for grid in self.feature_grids]
         features = torch.addmm(weight[-1], points, weight[:-1])
         as_it_is = torch.vstack((torch.ones_like(weight[-1]), torch.zeros_like(weight[-1])))
-        encoded = self.avfe(features, as_it_is, points, at, keep=True)
-        context = self.linear_of_context(encoded, at)
-        at = [scales[grid] for grid in self.projection_grids]
-        projected = self.avfeo(context, batch_norm(self.avfeo.features_norm, context), points, at, keep=False)
-        return [
-            project(maxima, scale.cursor, grid, batch_size)
-            for (_, maxima), scale, grid in zip(projected, at, self.projection_grids, strict=True)
-        ]
+        return self.avfe(features, as_it_is, points, [scales[grid] for grid in self.feature_grids], keep=True)
+
+    def voxel_features(
+        self, encoded: list[tuple[Tensor, Tensor]], points: Tensor, scales: dict[Grid, ScaleOfPoints]
+    ) -> list[Tensor]:
+        """AVFEO: M and G' of every feature scale to G' (V, N_H) of every projection scale."""
+        context = self.linear_of_context(encoded, [scales[grid] for grid in self.feature_grids])
+        norm = batch_norm(self.avfeo.features_norm, context)
+        projected = self.avfeo(context, norm, points, [scales[grid] for grid in self.projection_grids], keep=False)
+        return [maxima for _, maxima in projected]
 
     def linear_of_context(self, encoded: list[tuple[Tensor, Tensor]], voxels: list[ScaleOfPoints]) -> Tensor:
         """Linear(H), H (N, e) = [M, G'] of every feature scale, without H: the half in G' is one row a voxel."""
@@ -192,7 +200,7 @@ def batch_norm(norm: nn.BatchNorm1d, rows: Tensor) -> Tensor:
     return torch.vstack((scale, norm.bias - mean * scale))
 
 
-def project(features: Tensor, cursor: Tensor, grid: Grid, batch_size: int) -> Tensor:
+def write_image(features: Tensor, cursor: Tensor, grid: Grid, batch_size: int) -> Tensor:
     """Eq. 3: writes voxel features (V, C) at x = cursor div N_W, y = cursor mod N_W of a zero (B, C, N_L, N_W)."""
     image = features.new_zeros(batch_size * grid.shape[0] * grid.shape[1], features.shape[1])
     image.index_copy_(0, cursor, features)

@@ -1,0 +1,106 @@
+"""The benchmarks on tiny sizes: they compare their providers, write what they measured, and time nothing wrong."""
+
+import csv
+import json
+import math
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+ROOT = Path(__file__).resolve().parents[1]
+MACHINE = {"device", "threads", "copy_gb_s", "product_gflop_s", "python", "torch", "warp-lang", "torch-scatter"}
+
+# script, arguments, and a provider that some case must have
+SCRIPTS = [
+    ("voxel_encode", ["--max-points", "1000", "--no-compile"], "torch"),
+    ("scatter", ["--max-points", "1000"], "torch scatter_reduce"),
+    ("rotated", ["--boxes", "128", "--matrix", "64"], "numba twin"),
+]
+
+
+def bench(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, f"bench/{script}.py", *arguments], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.parametrize(("script", "arguments", "provider"), SCRIPTS)
+def test_measures_and_writes(script: str, arguments: list[str], provider: str, tmp_path: Path) -> None:
+    files = tmp_path / "new" / "rows.csv", tmp_path / "rows.json"
+    done = bench(script, *arguments, "--repeat", "2", "--csv", str(files[0]), "--json", str(files[1]))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert max(map(len, done.stdout.splitlines()[1:])) <= 100 or str(tmp_path) in done.stdout
+    with files[0].open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert set(rows[0]) >= MACHINE
+    assert provider in {row["provider"] for row in rows}
+    assert {row["threads"] for row in rows} == {"1"}
+    for row in rows:
+        assert 0 < float(row["p20_ms"]) <= float(row["median_ms"]) <= float(row["p80_ms"])
+    tree = json.loads(files[1].read_text(encoding="utf-8"))
+    assert [row["provider"] for row in tree["rows"]] == [row["provider"] for row in rows]
+    firsts = {row["case"]: row for row in reversed(tree["rows"])}
+    assert all(row["provider"].startswith(("hvnet", "PointPillars")) for row in firsts.values())
+    assert all(row["ratio"] == 1 for row in firsts.values())
+
+
+def test_plot(tmp_path: Path) -> None:
+    files = tmp_path / "plot.png", tmp_path / "rows.csv"
+    done = bench(
+        "voxel_encode", "--max-points", "1000", "--repeat", "1", "--plot", str(files[0]), "--csv", str(files[1])
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert files[0].read_bytes().startswith(b"\x89PNG")
+    with files[1].open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["case"] for row in rows} >= {"1,000 points, forward", "5 scales, forward + backward"}
+    assert all(float(row["peak_mb"]) > 0 for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("script", "wrong"),
+    [
+        (
+            "scatter",
+            "import hvnet.kernels.scatter as m; f = m.segment_max; m.segment_max = lambda *a: (f(*a)[0] + 1, 0)",
+        ),
+        ("rotated", "import hvnet.kernels.rotated as m; f = m.rotated_nms; m.rotated_nms = lambda *a: f(*a)[1:]"),
+        ("voxel_encode", "import hvnet.kernels.voxel as m; f = m.cursors; m.cursors = lambda *a: f(*a) + 1"),
+    ],
+)
+def test_a_wrong_provider_is_not_timed(script: str, wrong: str, tmp_path: Path) -> None:
+    arguments = next(arguments for name, arguments, _ in SCRIPTS if name == script)
+    file = tmp_path / "rows.csv"
+    code = f"{wrong}\nimport runpy, sys\nsys.path.insert(0, 'bench')\n"
+    code += f"runpy.run_path('bench/{script}.py', run_name='__main__')"
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments, "--repeat", "1", "--csv", str(file)],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "no timing: " in done.stderr
+    assert not file.exists()
+
+
+def test_mistakes_are_named() -> None:
+    done = bench("scatter", "--threads", "0")
+    assert done.returncode == 2
+    assert done.stderr == "error: --threads and --repeat: want 1 or more, got 0 and 20\n"
+    if not torch.cuda.is_available():
+        assert bench("rotated", "--device", "cuda").stderr == "error: --device cuda: torch sees no GPU here\n"
+
+
+def test_shares(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "bench")
+    timing = runpy.run_path(str(ROOT / "bench" / "timing.py"))
+    peak = timing["Peak"](copy=100.0, product=10.0)
+    assert peak.seconds(timing["Work"](200.0, 10.0)) == 2.0
+    assert peak.seconds(timing["Work"](200.0, 50.0)) == 5.0
+    for got in (torch.tensor([1.0, math.nan]), torch.tensor([1.0, 2.1]), torch.ones(3)):
+        with pytest.raises(SystemExit, match="no timing"):
+            timing["agree"]("sum", [got], [torch.tensor([1.0, 2.0])], 1e-4, 1e-4)
+    timing["agree"]("sum", [torch.tensor([1.0, 2.0001])], [torch.tensor([1.0, 2.0])], 1e-4, 0)
