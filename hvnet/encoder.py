@@ -18,7 +18,7 @@ from hvnet.kernels.encode import (
     scales_of,
     voxel_means,
 )
-from hvnet.kernels.scatter import Segments, segment_gather, segment_mean
+from hvnet.kernels.scatter import Segments, segment_add, segment_mean
 from hvnet.kernels.voxel import Grid, Voxels, is_nested, make_grid, nested_index, voxel_index
 
 POINT_CHANNELS = 4  # d: x, y, z, reflectance
@@ -172,7 +172,7 @@ class HybridVoxelEncoder(nn.Module):
         weights = self.avfeo.features.weight.chunk(2 * len(encoded), dim=1)
         total = torch.cat([product for product, _ in encoded], dim=1) @ torch.cat(weights[0::2], dim=1).T
         for (_, maxima), at, weight in zip(encoded, voxels, weights[1::2], strict=True):
-            total = total + segment_gather(maxima @ weight.T, at.segments)
+            total = segment_add(total, maxima @ weight.T, at.segments)
         return total
 
 

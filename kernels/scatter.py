@@ -79,6 +79,11 @@ def segment_gather(src: Tensor, voxels: Segments) -> Tensor:
     return _gather(src, voxels.voxel, voxels.order, voxels.starts)
 
 
+def segment_add(base: Tensor, src: Tensor, voxels: Segments) -> Tensor:
+    """base (N, C) plus the rows of src (V, C) that belong to its points, in one pass: base + segment_gather(src)."""
+    return _gather_add(base, src, voxels.voxel, voxels.order, voxels.starts)
+
+
 def _checked_segments(src: Tensor, index: Tensor, dim_size: int) -> Segments:
     check_tensor("src", src, FLOATS, (None, None))
     check_tensor("index", index, (torch.int64,), (src.shape[0],), like=src)
@@ -196,8 +201,22 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
             rounded[lane] = dtype(value[lane])
         values[voxel, c] = rounded
 
+    @wp.kernel(enable_backward=False, module=module)
+    def gather_add(
+        base: wp.array2d(dtype=vec),
+        src: wp.array2d(dtype=vec),
+        voxel: wp.array(dtype=wp.int64),
+        values: wp.array2d(dtype=vec),
+    ):
+        i, c = wp.tid()
+        values[i, c] = base[i, c] + src[int(voxel[i]), c]
+
     return SimpleNamespace(
-        maximum=maximum, maximum_with_nan=maximum_with_nan, maximum_backward=maximum_backward, total=total
+        gather_add=gather_add,
+        maximum=maximum,
+        maximum_with_nan=maximum_with_nan,
+        maximum_backward=maximum_backward,
+        total=total,
     )
 
 
@@ -264,6 +283,21 @@ def _(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> Tenso
     return src.new_empty(index.shape[0], src.shape[1])
 
 
+@torch.library.custom_op("hvnet::gather_add", mutates_args=())
+def _gather_add(base: Tensor, src: Tensor, voxel: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
+    count, lanes = base.shape[1], lanes_of(base.shape[1])
+    values = torch.empty_like(base, memory_format=torch.contiguous_format)
+    inputs = [channels(base.contiguous(), lanes), channels(src.contiguous(), lanes), array(voxel.contiguous())]
+    inputs += [channels(values, lanes)]
+    launch(_kernels(WARP_FLOAT[base.dtype], lanes).gather_add, (base.shape[0], count // lanes), inputs, base.device)
+    return values
+
+
+@_gather_add.register_fake
+def _(base: Tensor, src: Tensor, voxel: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
+    return torch.empty_like(base)
+
+
 def _save_max(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:
     ctx.mark_non_differentiable(output[1])
     ctx.save_for_backward(output[1], inputs[1])
@@ -286,6 +320,15 @@ def _gather_backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
     return _segment_sum(grad.contiguous(), *ctx.saved_tensors), None, None, None
 
 
+def _save_added(ctx: Any, inputs: tuple, output: Tensor) -> None:
+    ctx.save_for_backward(*inputs[2:])
+
+
+def _gather_add_backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None, None, None]:
+    return grad, _segment_sum(grad.contiguous(), *ctx.saved_tensors), None, None, None
+
+
+_gather_add.register_autograd(_gather_add_backward, setup_context=_save_added)
 _segment_max.register_autograd(_max_backward, setup_context=_save_max)
 _segment_sum.register_autograd(_sum_backward, setup_context=_save_segments)
 _gather.register_autograd(_gather_backward, setup_context=_save_segments)

@@ -139,6 +139,8 @@ def test_opcheck() -> None:
     src = torch.randn(20, 5, requires_grad=True)
     for op in (torch.ops.hvnet.segment_max, torch.ops.hvnet.segment_sum):
         torch.library.opcheck(op, (src, at.voxel, at.order, at.starts))
+    added = torch.randn(20, 5, requires_grad=True), torch.randn(6, 5, requires_grad=True)
+    torch.library.opcheck(torch.ops.hvnet.gather_add, (*added, at.voxel, at.order, at.starts))
     torch.library.opcheck(torch.ops.hvnet.column_sums, (src,))
     torch.library.opcheck(
         torch.ops.hvnet.gather, (torch.randn(6, 5, requires_grad=True), at.voxel, at.order, at.starts)

@@ -92,7 +92,16 @@ def test_kernel_has_twin_and_test(name: str) -> None:
     }
     # scatter's calls over segments that are at hand; the geometry of grids; the parts of inference, whose twin is the
     # encoder in evaluation mode
-    others = {"segments", "segment_max", "segment_mean", "segment_gather", "make_grid", "is_nested", "nested_index"}
+    others = {
+        "segments",
+        "segment_max",
+        "segment_mean",
+        "segment_gather",
+        "segment_add",
+        "make_grid",
+        "is_nested",
+        "nested_index",
+    }
     others |= {"scales_of", "voxel_means", "encode_voxels", "add_of_voxels", "project_voxels", "clear_voxels"}
     assert public - others - twins == set()
     assert (ROOT / "tests" / f"test_{name}.py").is_file()

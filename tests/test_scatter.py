@@ -309,6 +309,20 @@ def test_segments_at_hand(device: torch.device) -> None:
         assert torch.equal(gradient(at_hand, leaf, given), gradient(by_index, leaf, given))
 
 
+def test_segment_add_is_gather_and_sum(device: torch.device) -> None:
+    base, index, dim_size = random_case(60, 7, 9)
+    base, index = base.to(device).requires_grad_(), index.to(device)
+    rows = torch.randn_like(base[:dim_size]).detach().requires_grad_()
+    voxels = scatter.segments(index, dim_size)
+    for fused, plain in zip(
+        torch.autograd.grad(scatter.segment_add(base, rows, voxels).sin().sum(), (base, rows)),
+        torch.autograd.grad((base + scatter.gather(rows, index)).sin().sum(), (base, rows)),
+        strict=True,
+    ):
+        assert torch.equal(fused, plain)
+    assert torch.equal(scatter.segment_add(base, rows, voxels), base + scatter.gather(rows, index))
+
+
 def test_inputs_stay_as_they_are(device: torch.device) -> None:
     src, index, dim_size = random_case(50, 6, 9)
     src, index = src.float().to(device), index.to(device)
