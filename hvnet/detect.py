@@ -1,8 +1,15 @@
-"""Boxes for clouds: `python -m hvnet.detect`, on files, on folders of files and on KITTI roots."""
+"""Boxes for clouds: `python -m hvnet.detect`, on files, on folders of files and on KITTI roots.
+
+`--split test` makes a submission for the KITTI server: a zip file that holds one result file for every frame of the
+test set in its root (the readme of KITTI's object devkit), checked line by line before it is written.
+"""
 
 import argparse
 import csv
+import math
+import zipfile
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,16 +21,22 @@ from tqdm import tqdm
 from hvnet.cli import InputError, run_command
 from hvnet.data.clouds import SUFFIXES, read_cloud
 from hvnet.data.kitti import (
+    IMAGE_SIZE,
     Calibration,
     Labels,
     boxes_to_camera,
     detections_to_labels,
     read_frame,
+    read_labels,
     read_split,
     write_labels,
 )
 from hvnet.draw import draw_bev
+from hvnet.evaluate import CLASSES, evaluate, format_table
 from hvnet.model import Detections, Detector, load
+
+TEST_FRAMES = 7518
+"""Frames 000000 to 007517 are KITTI's test set; its server rejects results with fewer."""
 
 
 class Source(NamedTuple):
@@ -32,6 +45,11 @@ class Source(NamedTuple):
     name: str
     path: Path  # the file, or the root
     split_dir: str | None  # training or testing for a frame of a KITTI root
+
+    def kitti_file(self, folder: str, suffix: str) -> Path | None:
+        """The frame's file in a folder of its KITTI root, None if there is none."""
+        path = self.path / (self.split_dir or "") / folder / (self.name + suffix)
+        return path if self.split_dir is not None and path.is_file() else None
 
 
 class Cloud(NamedTuple):
@@ -79,13 +97,30 @@ def find_sources(inputs: Sequence[Path], split: str | None) -> list[Source]:
 
 def _kitti_sources(root: Path, split: str | None) -> list[Source]:
     folder = "testing" if split == "test" or not (root / "training").is_dir() else "training"
-    if split is not None:
+    # the test set is all of its folder, and KITTI's own download names its frames nowhere
+    if split is not None and (split != "test" or (root / "ImageSets" / "test.txt").is_file()):
         names = read_split(root, split, split_dir=folder, labelled=False)
-    else:
-        names = sorted(file.stem for file in (root / folder / "velodyne").glob("*.bin"))
-        if not names:
-            raise InputError(f"{root / folder / 'velodyne'}: holds no .bin file")
-    return [Source(name, root, folder) for name in names]
+        return [Source(name, root, folder) for name in names]
+    names = sorted(file.stem for file in (root / folder / "velodyne").glob("*.bin"))
+    if not names:
+        raise InputError(f"{root / folder / 'velodyne'}: holds no .bin file")
+    sources = [Source(name, root, folder) for name in names]
+    for source in sources:
+        if source.kitti_file("calib", ".txt") is None:
+            raise InputError(f"{root / folder / 'calib' / source.name}.txt: no such file; each frame wants one")
+    return sources
+
+
+def check_test_set(names: Sequence[str]) -> None:
+    """Raises InputError unless these are the frames of KITTI's test set, all of them and no other."""
+    wanted = [f"{k:06d}" for k in range(TEST_FRAMES)]
+    missing, strange = sorted(set(wanted) - set(names)), sorted(set(names) - set(wanted))
+    if missing or strange:
+        what = f"{len(missing)} of them are missing, the first is {missing[0]}" if missing else f"not {strange[0]}"
+        raise InputError(
+            f"--split test: the KITTI server wants the frames {wanted[0]} to {wanted[-1]}; {what}. Give the whole test "
+            "set, or --partial for results that cannot be submitted"
+        )
 
 
 def read_source(source: Source, classes: Sequence[str]) -> Cloud:
@@ -93,7 +128,7 @@ def read_source(source: Source, classes: Sequence[str]) -> Cloud:
     if source.split_dir is None:
         points, notes = read_cloud(source.path)
         return Cloud(torch.from_numpy(points), torch.zeros(0, 7), None, (0, 0), notes)
-    labelled = (source.path / source.split_dir / "label_2" / f"{source.name}.txt").is_file()
+    labelled = source.kitti_file("label_2", ".txt") is not None
     frame = read_frame(source.path, source.name, source.split_dir, labelled=labelled)
     notes = [f"frame {frame.id}: {frame.dropped} points that are not finite were dropped"] if frame.dropped else []
     truth = frame.boxes[[name in classes for name in frame.names]]
@@ -101,10 +136,15 @@ def read_source(source: Source, classes: Sequence[str]) -> Cloud:
 
 
 def result_rows(found: Detections, cloud: Cloud, classes: Sequence[str]) -> Labels:
-    """The rows of a KITTI result file. Without calibration the 2D boxes are -1 and the camera stands at the LiDAR."""
+    """The rows of a KITTI result file. Without calibration the 2D boxes are -1 and the camera stands at the LiDAR.
+
+    Of a box with less than 0.01 pixels in the image nothing is reported: rounded it would have no area.
+    """
     names = [classes[label] for label in found.labels.tolist()]
     if cloud.calib is not None:
-        return detections_to_labels(found.boxes, found.scores, names, cloud.calib, cloud.image_size)
+        rows = detections_to_labels(found.boxes, found.scores, names, cloud.calib, cloud.image_size)
+        size = rows.bbox[:, 2:] - rows.bbox[:, :2]
+        return rows.select(size.min(axis=1) >= 0.01)
     dimensions, location, rotation_y = boxes_to_camera(found.boxes.double().cpu().numpy(), NO_IMAGE)
     alpha = rotation_y - np.arctan2(location[:, 0], location[:, 2])
     return Labels(
@@ -126,8 +166,52 @@ def csv_rows(name: str, found: Detections, classes: Sequence[str]) -> Iterator[l
         yield [name, classes[label], f"{score:.4f}", *(f"{value:.3f}" for value in box)]
 
 
-def detect(detector: Detector, sources: Sequence[Source], out: Path, pictures: int) -> int:
-    """Writes results/NAME.txt, boxes.csv and the first few pictures/NAME.png; returns the number of boxes."""
+def submission_rows(rows: Labels) -> Labels:
+    """The rows that the KITTI server scores: of its classes, with angles that stay in [-pi, pi] when rounded."""
+    limit = 3.1415
+    rows = replace(rows, alpha=rows.alpha.clip(-limit, limit), rotation_y=rows.rotation_y.clip(-limit, limit))
+    return rows.select(np.isin(rows.name, CLASSES))
+
+
+def check_results(path: Path, image_size: tuple[int, int]) -> None:
+    """Raises InputError, naming file and line, if the KITTI server would reject or misread a result file."""
+    rows = read_labels(path, scored=True)  # 16 fields, all numbers finite, a known class
+    angles = np.abs(np.column_stack((rows.alpha, rows.rotation_y)))
+    wrong = {
+        "a class that is not scored": ~np.isin(rows.name, CLASSES),
+        "a 2D box without area": (rows.bbox[:, 2:] <= rows.bbox[:, :2]).any(axis=1),
+        "a 2D box outside the image": ((rows.bbox < 0) | (rows.bbox > np.tile(image_size, 2) - 1)).any(axis=1),
+        "a 3D box without volume": (rows.dimensions <= 0).any(axis=1),
+        "an angle outside [-pi, pi]": (angles > math.pi).any(axis=1),
+    }
+    for what, found in wrong.items():
+        if found.any():
+            raise InputError(f"{path}:{found.argmax() + 1}: {what}; the KITTI server wants none")
+
+
+def write_submission(path: Path, results: Path) -> None:
+    """Packs all result files into the root of a zip file, the same bits for the same results."""
+    with zipfile.ZipFile(path, "w") as archive:
+        for file in sorted(results.iterdir()):
+            archive.writestr(zipfile.ZipInfo(file.name), file.read_bytes(), zipfile.ZIP_DEFLATED)
+
+
+def score_results(sources: Sequence[Source], results: Path, classes: Sequence[str]) -> str | None:
+    """The table of `hvnet.evaluate` for the result files, None unless every source is a frame with labels."""
+    label_files = [file for source in sources if (file := source.kitti_file("label_2", ".txt")) is not None]
+    scored = [name for name in CLASSES if name in classes]
+    if len(label_files) < len(sources) or not scored:
+        return None
+    labels = [read_labels(file) for file in label_files]
+    predictions = [read_labels(results / f"{source.name}.txt", scored=True) for source in sources]
+    return format_table(evaluate(labels, predictions, classes=scored))
+
+
+def detect(detector: Detector, sources: Sequence[Source], out: Path, pictures: int, submit: bool = False) -> int:
+    """Writes results/NAME.txt, boxes.csv and the first few pictures/NAME.png; returns the number of boxes.
+
+    With `submit` the results are made and checked for the KITTI server, and submission.zip is written last.
+    """
     total = 0
     for k, source in enumerate(tqdm(sources, desc="detecting", unit="cloud", dynamic_ncols=True)):
         cloud = read_source(source, detector.classes)
@@ -135,7 +219,10 @@ def detect(detector: Detector, sources: Sequence[Source], out: Path, pictures: i
             tqdm.write(note)
         found = Detections(*(part.cpu() for part in detector(cloud.points)))
         (out / "results").mkdir(parents=True, exist_ok=True)  # not before the first cloud is read
-        write_labels(out / "results" / f"{source.name}.txt", result_rows(found, cloud, detector.classes))
+        rows, result_file = result_rows(found, cloud, detector.classes), out / "results" / f"{source.name}.txt"
+        write_labels(result_file, submission_rows(rows) if submit else rows)
+        if submit:
+            check_results(result_file, cloud.image_size)
         with (out / "boxes.csv").open("a", newline="", encoding="utf-8") as file:
             table = csv.writer(file)
             if k == 0:
@@ -146,24 +233,42 @@ def detect(detector: Detector, sources: Sequence[Source], out: Path, pictures: i
             path = out / "pictures" / f"{source.name}.png"
             draw_bev(path, cloud.points, point_range, cloud.truth, *found, detector.classes, source.name)
         total += len(found.boxes)
+    if submit:
+        write_submission(out / "submission.zip", out / "results")
     return total
+
+
+def latest_checkpoint(runs: Path) -> Path:
+    """The checkpoint that was written last by a run below a folder. Raises InputError if there is none."""
+    found = sorted(runs.glob("*/checkpoint.pt"), key=lambda path: path.stat().st_mtime_ns)
+    if not found:
+        raise InputError(f"{runs}: holds no run; give --checkpoint FILE, or train with python -m hvnet.train")
+    return found[-1]
 
 
 def main(arguments: Sequence[str] | None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(
         prog="python -m hvnet.detect",
-        description="Detects objects in point clouds; writes KITTI result files (results/), all boxes in LiDAR axes"
-        " (boxes.csv) and bird's eye views (pictures/).",
+        description="Detects objects in point clouds; writes KITTI result files (results/), all boxes in LiDAR axes\n"
+        "(boxes.csv) and bird's eye views (pictures/). Where every cloud is a KITTI frame with labels, the\n"
+        "results are scored, too. --split test writes submission.zip for the KITTI server.",
         epilog="examples:\n  python -m hvnet.detect cloud.pcd --checkpoint runs/demo/checkpoint.pt\n"
-        "  python -m hvnet.detect /data/kitti --split val --checkpoint runs/compact/checkpoint.pt --out val",
+        "  python -m hvnet.detect clouds/ --checkpoint runs/demo/checkpoint.pt --pictures 0\n"
+        "  python -m hvnet.detect /data/kitti --split val --checkpoint runs/compact/checkpoint.pt --out val\n"
+        "  python -m hvnet.detect /data/kitti --split test --checkpoint runs/hvnet/checkpoint.pt --out test",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "inputs", nargs="+", type=Path, metavar="INPUT", help=f"files ({', '.join(SUFFIXES)}), folders, KITTI roots"
     )
-    parser.add_argument("--checkpoint", required=True, type=Path, metavar="FILE", help="of python -m hvnet.train")
+    parser.add_argument(
+        "--checkpoint", type=Path, metavar="FILE", help="of python -m hvnet.train (default: the latest below runs/)"
+    )
     parser.add_argument("--split", help="frames of ImageSets/SPLIT.txt of a KITTI root (default: all frames)")
+    parser.add_argument(
+        "--partial", action="store_true", help="with --split test: take the frames there are; no submission is written"
+    )
     parser.add_argument("--out", type=Path, default=Path("detections"), metavar="DIR", help="(default: detections)")
     parser.add_argument("--pictures", type=int, default=20, metavar="N", help="draw the first N clouds (default: 20)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
@@ -171,13 +276,28 @@ def main(arguments: Sequence[str] | None) -> None:
 
     if options.out.exists() and (not options.out.is_dir() or any(options.out.iterdir())):
         raise InputError(f"{options.out}: is not empty; give another --out")
-    detector = load(options.checkpoint, options.device)
+    if options.partial and options.split != "test":
+        raise InputError("--partial: is for --split test")
+    submit = options.split == "test" and not options.partial
     sources = find_sources(options.inputs, options.split)
-    total = detect(detector, sources, options.out, options.pictures)
+    if submit:
+        check_test_set([source.name for source in sources])
+        blind = sum(source.kitti_file("image_2", ".png") is None for source in sources)
+        if blind:
+            width, height = IMAGE_SIZE
+            print(f"{blind} frames have no file in image_2; their 2D boxes are clipped to {width} x {height}")
+    detector = load(options.checkpoint or latest_checkpoint(Path("runs")), options.device)
+    total = detect(detector, sources, options.out, options.pictures, submit)
+    if scores := score_results(sources, options.out / "results", detector.classes):
+        print(scores + "\n")
     print(f"{total} boxes in {len(sources)} clouds")
-    print(f"results:  {options.out / 'results'}\nboxes:    {options.out / 'boxes.csv'}")
+    print(f"results:    {options.out / 'results'}\nboxes:      {options.out / 'boxes.csv'}")
     if options.pictures > 0:
-        print(f"pictures: {options.out / 'pictures'}")
+        print(f"pictures:   {options.out / 'pictures'}")
+    if submit:
+        print(f"submission: {options.out / 'submission.zip'}")
+    elif options.split == "test":
+        print(f"no submission: --partial was given, and the KITTI server wants {TEST_FRAMES} frames")
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from hvnet.kernels.encode import (
     project_voxels,
     scales_of,
     voxel_means,
+    write_image,
 )
 from hvnet.kernels.scatter import Segments, segment_add, segment_mean
 from hvnet.kernels.voxel import Grid, Voxels, is_nested, make_grid, nested_index, voxel_index
@@ -144,10 +145,11 @@ class HybridVoxelEncoder(nn.Module):
         points = points[index.order]
         scales = {grid: scale_of_points(points, voxels) for grid, voxels in zip(grids, index.scales, strict=True)}
         projected = self.voxel_features(self.point_features(points, scales), points, scales)
-        return [
-            write_image(maxima, scales[grid].cursor, grid, batch_size)
-            for maxima, grid in zip(projected, self.projection_grids, strict=True)
-        ]
+        images = []
+        for maxima, grid in zip(projected, self.projection_grids, strict=True):
+            image = write_image(maxima, scales[grid].cursor, batch_size * grid.shape[0] * grid.shape[1])
+            images.append(image.view(batch_size, *grid.shape, -1).permute(0, 3, 1, 2))
+        return images
 
     def point_features(self, points: Tensor, scales: dict[Grid, ScaleOfPoints]) -> list[tuple[Tensor, Tensor]]:
         """AVFE: points (N, d) to M (N, q) and G' (V, q) of every feature scale."""
@@ -198,13 +200,6 @@ def batch_norm(norm: nn.BatchNorm1d, rows: Tensor) -> Tensor:
         update_statistics(norm, mean.detach(), variance.detach() * (count / (count - 1)))
     scale = norm.weight * torch.rsqrt(variance + norm.eps)
     return torch.vstack((scale, norm.bias - mean * scale))
-
-
-def write_image(features: Tensor, cursor: Tensor, grid: Grid, batch_size: int) -> Tensor:
-    """Eq. 3: writes voxel features (V, C) at x = cursor div N_W, y = cursor mod N_W of a zero (B, C, N_L, N_W)."""
-    image = features.new_zeros(batch_size * grid.shape[0] * grid.shape[1], features.shape[1])
-    image.index_copy_(0, cursor, features)
-    return image.view(batch_size, *grid.shape, -1).permute(0, 3, 1, 2)
 
 
 class FusedEncoder:

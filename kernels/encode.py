@@ -9,6 +9,7 @@ import functools
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -51,6 +52,13 @@ def column_sums(rows: Tensor) -> tuple[Tensor, Tensor]:
     """Sums (C,) of the columns of rows (N, C) and of their squares, in float64 and in a fixed order."""
     check_tensor("rows", rows, FLOATS, (None, None))
     return _column_sums(rows)
+
+
+def write_image(features: Tensor, cursor: Tensor, cells: int) -> Tensor:
+    """Eq. 3: the rows of features (V, C) at their cursors (V,) int64, no two alike, of an image (cells, C) of zeros."""
+    check_tensor("features", features, FLOATS, (None, None))
+    check_tensor("cursor", cursor, (torch.int64,), (features.shape[0],), like=features)
+    return _write_image(features, cursor, cells)
 
 
 class Scale(NamedTuple):
@@ -580,3 +588,31 @@ def _column_sums_backward(ctx: Any, grad_total: Tensor, grad_squares: Tensor) ->
 
 
 _column_sums.register_autograd(_column_sums_backward, setup_context=_save_rows)
+
+
+@torch.library.custom_op("hvnet::write_image", mutates_args=())
+def _write_image(features: Tensor, cursor: Tensor, cells: int) -> Tensor:
+    shape = (cells, features.shape[1])
+    if features.device.type == "cpu":
+        # from calloc: a page that no voxel lies in is never written, and most are such
+        image = torch.from_numpy(np.zeros(shape, dtype=np.float32 if features.dtype == torch.float32 else np.float64))
+    else:
+        image = features.new_zeros(shape)
+    return image.index_copy_(0, cursor, features)
+
+
+@_write_image.register_fake
+def _(features: Tensor, cursor: Tensor, cells: int) -> Tensor:
+    return features.new_empty(cells, features.shape[1])
+
+
+def _save_cursor(ctx: Any, inputs: tuple, output: Tensor) -> None:
+    ctx.save_for_backward(inputs[1])
+
+
+def _write_image_backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+    (cursor,) = ctx.saved_tensors
+    return grad.index_select(0, cursor), None, None
+
+
+_write_image.register_autograd(_write_image_backward, setup_context=_save_cursor)

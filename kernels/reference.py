@@ -168,6 +168,11 @@ def attend(
     return product if keep else product[:0], values
 
 
+def write_image(features: Tensor, cursor: Tensor, cells: int) -> Tensor:
+    """Eq. 3: features (V, C) at their cursors (V,) of an image (cells, C) of zeros."""
+    return features.new_zeros(cells, features.shape[1]).index_copy(0, cursor, features)
+
+
 def column_sums(rows: Tensor) -> tuple[Tensor, Tensor]:
     """Sums (C,) of the columns of rows (N, C), and of their squares, in float64."""
     return rows.double().sum(dim=0), rows.double().square().sum(dim=0)

@@ -2,10 +2,12 @@
 
 import csv
 import dataclasses
+import os
 import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +18,20 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 from pypcd4 import Encoding, PointCloud
 
+from hvnet import evaluate
 from hvnet.boxes import limit_angle
 from hvnet.cli import InputError
 from hvnet.config import config_to_dict, load_config
-from hvnet.data.kitti import Calibration, boxes_to_lidar, project_boxes, read_calibration, read_labels, read_points
-from hvnet.detect import NO_IMAGE, Cloud, csv_rows, main, result_rows
+from hvnet.data.kitti import (
+    Calibration,
+    boxes_to_lidar,
+    project_boxes,
+    read_calibration,
+    read_labels,
+    read_points,
+    write_labels,
+)
+from hvnet.detect import NO_IMAGE, Cloud, check_results, csv_rows, latest_checkpoint, main, result_rows, submission_rows
 from hvnet.model import Detections, HVNet, load, save_checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -235,15 +246,164 @@ def test_kitti_root_without_labels(checkpoint: Path, scenes: Path, tmp_path: Pat
         (root / "testing" / folder).mkdir(parents=True)
         for path in sorted((scenes / "training" / folder).iterdir())[:2]:
             shutil.copy(path, root / "testing" / folder)
-    (root / "ImageSets").mkdir()
-    (root / "ImageSets" / "test.txt").write_text("000001\n")
     detect(checkpoint, tmp_path / "all", root, options=("--pictures", "1"))
     assert len(list((tmp_path / "all" / "results").iterdir())) == 2
     (root / "training").mkdir()
-    detect(checkpoint, tmp_path / "test", root, options=("--split", "test", "--pictures", "0"))
-    assert [path.name for path in (tmp_path / "test" / "results").iterdir()] == ["000001.txt"]
     with pytest.raises(InputError, match=r"velodyne: holds no \.bin file"):
         detect(checkpoint, tmp_path / "none", root)
+    (root / "testing" / "calib" / "000001.txt").unlink()
+    (root / "training").rmdir()
+    with pytest.raises(InputError, match=r"calib.000001\.txt: no such file"):
+        detect(checkpoint, tmp_path / "none", root)
+
+
+def test_labelled_frames_are_scored(
+    checkpoint: Path, scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The table is that of `hvnet.evaluate` for the files written."""
+    detect(checkpoint, tmp_path / "out", scenes, options=("--split", "val", "--pictures", "0"))
+    printed = capsys.readouterr().out
+    label_dir, results, frames = scenes / "training" / "label_2", tmp_path / "out" / "results", scenes / "ImageSets"
+    evaluate.main(["--labels", str(label_dir), "--predictions", str(results), "--frames", str(frames / "val.txt")])
+    table = capsys.readouterr().out.partition("\n\n2 frames scored")[0]
+    assert len(table) > 100
+    assert table in printed
+
+
+# --- the test set -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def test_set(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A KITTI root whose test set has 3 frames, as if KITTI's had; without ImageSets, as it is downloaded."""
+    monkeypatch.setattr("hvnet.detect.TEST_FRAMES", 3)
+    root = tmp_path / "kitti"
+    for folder in ("velodyne", "calib"):
+        (root / "testing" / folder).mkdir(parents=True)
+        for path in sorted((scenes / "training" / folder).iterdir())[:3]:
+            shutil.copy(path, root / "testing" / folder)
+    (root / "testing" / "image_2").mkdir()
+    Image.new("RGB", (1224, 370)).save(root / "testing" / "image_2" / "000000.png")
+    return root
+
+
+def test_submission(checkpoint: Path, test_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    detect(checkpoint, tmp_path / "out", test_set, options=("--split", "test", "--pictures", "0"))
+    printed = capsys.readouterr().out
+    assert "2 frames have no file in image_2; their 2D boxes are clipped to 1242 x 375" in printed
+    assert f"submission: {tmp_path / 'out' / 'submission.zip'}" in printed
+    with zipfile.ZipFile(tmp_path / "out" / "submission.zip") as archive:
+        packed = {name: archive.read(name) for name in archive.namelist()}
+    assert list(packed) == ["000000.txt", "000001.txt", "000002.txt"]
+    assert packed == contents(tmp_path / "out" / "results")
+    for name, content in packed.items():
+        width, height = (1224, 370) if name == "000000.txt" else (1242, 375)
+        rows = [line.split(" ") for line in content.decode().splitlines()]
+        assert len(rows) > 0
+        assert {row[0] for row in rows} <= {"Car", "Pedestrian", "Cyclist"}
+        numbers = np.array([row[1:] for row in rows], np.float64)
+        assert numbers.shape[1] == 15
+        assert np.isfinite(numbers).all()
+        assert (np.abs(numbers[:, [2, 13]]) <= np.pi).all()
+        left, top, right, bottom = numbers[:, 3:7].T
+        assert ((left >= 0) & (left < right) & (right <= width - 1)).all()
+        assert ((top >= 0) & (top < bottom) & (bottom <= height - 1)).all()
+        assert (numbers[:, 7:10] > 0).all()
+
+    # the same again is the same zip, byte for byte; a list of frames in any order does not matter
+    (test_set / "ImageSets").mkdir()
+    (test_set / "ImageSets" / "test.txt").write_text("000002\n000000\n000001\n")
+    detect(checkpoint, tmp_path / "again", test_set, options=("--split", "test", "--pictures", "0"))
+    assert (tmp_path / "again" / "submission.zip").read_bytes() == (tmp_path / "out" / "submission.zip").read_bytes()
+
+
+def test_a_part_of_the_test_set_is_no_submission(
+    checkpoint: Path, test_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    (test_set / "testing" / "velodyne" / "000001.bin").unlink()
+    message = "wants the frames 000000 to 000002; 1 of them are missing, the first is 000001. .*--partial"
+    with pytest.raises(InputError, match=message):
+        detect(checkpoint, out, test_set, options=("--split", "test"))
+    assert not out.exists()
+    with pytest.raises(InputError, match="--partial: is for --split test"):
+        detect(checkpoint, out, test_set, options=("--partial",))
+    detect(checkpoint, out, test_set, options=("--split", "test", "--partial", "--pictures", "0"))
+    assert sorted(path.name for path in out.iterdir()) == ["boxes.csv", "results"]
+    assert [path.name for path in sorted((out / "results").iterdir())] == ["000000.txt", "000002.txt"]
+    assert "no submission" in capsys.readouterr().out
+
+
+def test_a_frame_that_the_server_does_not_know(
+    checkpoint: Path, test_set: Path, cloud: NDArray[np.float32], tmp_path: Path
+) -> None:
+    np.save(tmp_path / "cloud.npy", cloud)
+    with pytest.raises(InputError, match="000000 to 000002; not cloud"):
+        detect(checkpoint, tmp_path / "out", test_set, tmp_path / "cloud.npy", options=("--split", "test"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_submission_of_a_class_that_is_not_scored(scenes: Path, tmp_path: Path) -> None:
+    """A van is left out, and angles that would be rounded to more than pi are not."""
+    calib = read_calibration(scenes / "training" / "calib" / "000000.txt")
+    boxes = torch.tensor([[10.0, 0, -1, 4, 1.7, 1.5, np.pi / 2], [15, 0, -1, 4, 1.7, 1.5, 0]])
+    cloud = Cloud(torch.zeros(0, 4), torch.zeros(0, 7), calib, (1242, 375), [])
+    found = Detections(boxes, torch.tensor([0.9, 0.8]), torch.tensor([0, 1]))
+    rows = result_rows(found, cloud, ("Car", "Van"))
+    assert rows.name.tolist() == ["Car", "Van"]
+    write_labels(tmp_path / "000000.txt", rows)
+    with pytest.raises(InputError, match=r"000000\.txt:2: a class that is not scored"):
+        check_results(tmp_path / "000000.txt", (1242, 375))
+    rows = submission_rows(rows)
+    assert rows.name.tolist() == ["Car"]
+    assert abs(rows.rotation_y[0]) == pytest.approx(np.pi, abs=1e-4)
+    write_labels(tmp_path / "000000.txt", rows)
+    check_results(tmp_path / "000000.txt", (1242, 375))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        (0, "Bus", "unknown class 'Bus'"),
+        (0, "DontCare", "a class that is not scored"),
+        (4, "nan", "not a finite number"),
+        (15, "inf", "not a finite number"),
+        (15, "", "15 fields, expected 16"),
+        (4, "-0.1", "a 2D box outside the image"),
+        (6, "1241.5", "a 2D box outside the image"),
+        (7, "375", "a 2D box outside the image"),
+        (6, "100", "a 2D box without area"),
+        (8, "0", "a 3D box without volume"),
+        (3, "-3.1416", "an angle outside"),
+        (14, "3.2", "an angle outside"),
+    ],
+)
+def test_results_that_the_server_would_reject(tmp_path: Path, field: int, value: str, message: str) -> None:
+    line = "Car -1 -1 0.1 100 100 1241 374 1.5 2 4 1 1.6 20 0.1 0.75"
+    path = tmp_path / "000000.txt"
+    path.write_text(f"{line}\n")
+    check_results(path, (1242, 375))
+    fields = line.split()
+    fields[field] = value
+    path.write_text(f"{line}\n{' '.join(fields)}\n")
+    with pytest.raises(InputError, match=rf"000000\.txt:2: .*{message}"):
+        check_results(path, (1242, 375))
+
+
+def test_box_with_a_sliver_in_the_image_is_not_reported(scenes: Path) -> None:
+    """Its 2D box is 0.004 pixels wide, which four digits would make a line or nothing."""
+    calib = read_calibration(scenes / "training" / "calib" / "000000.txt")
+    box = np.array([[12.0, 9.0, -1, 4, 1.7, 1.5, 0]])
+    low, high = 5.0, 30.0  # metres to the left, partly in the image and outside
+    for _ in range(60):
+        box[0, 1] = (low + high) / 2
+        bbox, visible = project_boxes(box, calib, (1242, 375))
+        low, high = (box[0, 1], high) if visible[0] and bbox[0, 2] > 0.004 else (low, box[0, 1])
+    box[0, 1] = low
+    assert 0 < project_boxes(box, calib, (1242, 375))[0][0, 2] < 0.01
+    found = Detections(torch.from_numpy(box), torch.tensor([0.9]), torch.tensor([0]))
+    cloud = Cloud(torch.zeros(0, 4), torch.zeros(0, 7), calib, (1242, 375), [])
+    assert len(result_rows(found, cloud, ("Car",))) == 0
 
 
 # --- mistakes ---------------------------------------------------------------------------------------------------------
@@ -305,3 +465,14 @@ def test_the_command(checkpoint: Path, tmp_path: Path) -> None:
     assert failed.returncode == 2
     assert failed.stdout == ""
     assert failed.stderr == f"error: {missing}: no such file or folder\n"
+
+
+def test_the_latest_checkpoint_is_taken(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no run; give --checkpoint FILE, or train"):
+        latest_checkpoint(tmp_path)
+    for k, name in enumerate(("b", "c", "a")):
+        path = tmp_path / name / "checkpoint.pt"
+        path.parent.mkdir()
+        path.touch()
+        os.utime(path, (k, k))
+    assert latest_checkpoint(tmp_path) == tmp_path / "a" / "checkpoint.pt"

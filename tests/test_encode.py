@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from hvnet.kernels import reference
-from hvnet.kernels.encode import attend, column_sums, knowledge
+from hvnet.kernels.encode import attend, column_sums, knowledge, write_image
 from hvnet.kernels.scatter import Segments, scatter_mean, segments
 from hvnet.kernels.voxel import hash_index
 
@@ -94,6 +94,19 @@ def test_column_sums(count: int, channels: int, dtype: torch.dtype, device: torc
         torch.testing.assert_close(got, want, rtol=tolerance, atol=tolerance)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("count", [0, 1, 30])
+def test_write_image(count: int, dtype: torch.dtype, device: torch.device) -> None:
+    features = torch.randn(count, 5, dtype=dtype, device=device, requires_grad=True)
+    cursor = torch.randperm(40, generator=torch.Generator().manual_seed(count))[:count].to(device)
+    results = []
+    for function in (write_image, reference.write_image):
+        image = function(features, cursor, 40)
+        results.append((image, *torch.autograd.grad(image.cos().sum(), features)))
+    assert all(torch.equal(got, want) for got, want in zip(*results, strict=True))
+    assert ((results[0][0] != 0).any(dim=1)).sum() == count
+
+
 def test_knowledge_by_hand(device: torch.device) -> None:
     points = torch.tensor([[1.0, 2.0, 3.0, 0.5], [3.0, 2.0, 1.0, 0.1], [7.0, 7.0, 7.0, 0.7]], device=device)
     mean = torch.tensor([[2.0, 2.0, 2.0, 0.25], [7.0, 7.0, 7.0, 0.75]], device=device)
@@ -141,6 +154,7 @@ def test_opcheck() -> None:
         torch.library.opcheck(op, (src, at.voxel, at.order, at.starts))
     added = torch.randn(20, 5, requires_grad=True), torch.randn(6, 5, requires_grad=True)
     torch.library.opcheck(torch.ops.hvnet.gather_add, (*added, at.voxel, at.order, at.starts))
+    torch.library.opcheck(torch.ops.hvnet.write_image, (added[1], torch.tensor([5, 0, 3, 8, 1, 2]), 9))
     torch.library.opcheck(torch.ops.hvnet.column_sums, (src,))
     torch.library.opcheck(
         torch.ops.hvnet.gather, (torch.randn(6, 5, requires_grad=True), at.voxel, at.order, at.starts)

@@ -94,6 +94,29 @@ def test_detection_on_a_van_is_neither_right_nor_wrong():
     assert score_cars([CAR, "Truck 10 20 300 50"], detections)["exact"]["3d"] == [50, 50, 50]
 
 
+def test_pedestrian_on_a_person_sitting_is_neither_right_nor_wrong():
+    # As with the van; a cyclist is no neighbour, so that there the precision is 1/2 where the pedestrian is found.
+    truth = "Pedestrian 0 20 100 50"
+    detections = [truth + " score=0.5", "Pedestrian 10 20 300 50 score=0.9"]
+    for other, precision in (("Person_sitting", 100), ("Cyclist", 50)):
+        truths = rows(truth, f"{other} 10 20 300 50")
+        scored = evaluate([truths], [rows(*detections, scored=True)], classes=["Pedestrian"])["Pedestrian"]
+        assert scored["exact"]["3d"] == [precision] * 3
+
+
+def test_first_pass_matches_by_score_and_second_by_overlap():
+    # Cars at 0 and 0.8 m. A at 0.4 m (score 0.9) overlaps both by 3.6 / 4.4 = 0.82; B at 0 m (score 0.8) is the first
+    # car, and overlaps the second by 3.2 / 4.8 = 0.67 only. First pass: the first car takes A, nothing is left for the
+    # second: one threshold, so that R40 is 0. By overlap there would be two: 1/40. Second pass with A and B: the first
+    # car takes B, the second A: all is found, exact 100. By score there would be a miss and a false positive: 50.
+    car = score_cars([CAR, "Car 0.8 20 112 50"], ["Car 0.4 20 106 50 score=0.9", CAR + " score=0.8"])
+    for metric in ("2d", "bev", "3d"):
+        assert car["R40"][metric] == [0, 0, 0]
+        assert car["R11"][metric] == pytest.approx([100 / 11] * 3)
+        assert car["exact"][metric] == [100, 100, 100]
+    assert car["report"]["misses"] == car["report"]["false_positives"] == [0, 0, 0]
+
+
 def test_detection_on_dontcare_counts_for_nothing_in_2d_only():
     # A region has no 3D box: in BEV and 3D the same detection is a false positive. It needs 0.7 of the detection's own
     # area in the region: of columns 300 to 360, 300 to 345 are enough (0.75), 300 to 340 are not (0.67).
