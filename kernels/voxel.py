@@ -13,6 +13,8 @@ from hvnet.kernels.launch import array, check_index, check_tensor, launch
 from hvnet.kernels.scatter import Segments, segments
 
 KEY_BITS = 62  # of a sort key in int64
+DIGIT_BITS = wp.constant(11)  # of a pass of the radix sort
+DIGITS = wp.constant(1 << 11)
 OUTSIDE = wp.constant(1 << 62)  # the key of a point outside, after all others
 
 
@@ -176,17 +178,36 @@ def nested_index(points: Tensor, sample: Tensor, grids: Sequence[Grid]) -> Neste
     low, reciprocal = wp.vec2(finest.x_min, finest.y_min), wp.vec2(1.0 / finest.cell[0], 1.0 / finest.cell[1])
     inputs = [array(points.contiguous()), array(sample.contiguous()), low, height, reciprocal, cells]
     launch(_key_kernel, count, [*inputs, wp.int64(2 * bits), array(keys)], device)
-    keys, order = torch.sort(keys, stable=True)
+    of_scales = _scales(tuple(grids), tuple(levels), device)
+    return (
+        _serial_index(keys, of_scales, 2 * bits) if device.type == "cpu" else _parallel_index(keys, of_scales, 2 * bits)
+    )
 
-    first = torch.empty(len(grids), count, dtype=torch.int64, device=device)
-    scales = array(_scales(tuple(grids), tuple(levels), device))
-    launch(_first_kernel, first.shape, [array(keys), scales, array(first)], device)
+
+def _parallel_index(keys: Tensor, of_scales: Tensor, bits: int) -> NestedIndex:
+    """The index of points with these keys (N,), for many threads: a sort, a sum over the first points, a write."""
+    count, scales = len(keys), len(of_scales)
+    keys, order = torch.sort(keys, stable=True)
+    first = torch.empty(scales, count, dtype=torch.int64, device=keys.device)
+    launch(_first_kernel, first.shape, [array(keys), array(of_scales), array(first)], keys.device)
     voxel = first.cumsum(dim=1) - 1
-    starts = torch.zeros(len(grids), count + 1, dtype=torch.int64, device=device)
-    cursor = torch.empty(len(grids), count, dtype=torch.int64, device=device)
-    counts = torch.zeros(len(grids) + 1, dtype=torch.int64, device=device)
-    outputs = [array(starts), array(cursor), array(counts)]
-    launch(_fill_kernel, first.shape, [array(keys), scales, array(voxel), wp.int64(2 * bits), *outputs], device)
+    starts = torch.zeros(scales, count + 1, dtype=torch.int64, device=keys.device)
+    cursor = torch.empty(scales, count, dtype=torch.int64, device=keys.device)
+    counts = torch.zeros(scales + 1, dtype=torch.int64, device=keys.device)
+    inputs = [array(keys), array(of_scales), array(voxel), wp.int64(bits), array(starts), array(cursor), array(counts)]
+    launch(_fill_kernel, first.shape, inputs, keys.device)
+    return NestedIndex(order, voxel, starts, cursor, counts)
+
+
+def _serial_index(keys: Tensor, of_scales: Tensor, bits: int) -> NestedIndex:
+    """The same for one thread: a radix sort of the points inside, then one walk over them for all scales."""
+    count, scales = len(keys), len(of_scales)
+    order, work = torch.empty(count, dtype=torch.int64), torch.empty(3, count, dtype=torch.int64)
+    voxel, cursor = (torch.empty(scales, count, dtype=torch.int64) for _ in range(2))
+    starts, counts = torch.empty(scales, count + 1, dtype=torch.int64), torch.zeros(scales + 1, dtype=torch.int64)
+    digits = torch.empty(DIGITS, dtype=torch.int64)
+    inputs = [array(tensor) for tensor in (keys, of_scales, work, digits, order, voxel, starts, cursor, counts)]
+    launch(_serial_kernel, 1, [wp.int64(bits), *inputs], keys.device)
     return NestedIndex(order, voxel, starts, cursor, counts)
 
 
@@ -349,6 +370,69 @@ def _fill_kernel(
         counts[s] = wp.int64(v + 1)
         if s == 0:
             counts[scales.shape[0]] = wp.int64(i + 1)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _serial_kernel(
+    bits: wp.int64,
+    keys: wp.array(dtype=wp.int64),
+    scales: wp.array2d(dtype=wp.int64),
+    work: wp.array2d(dtype=wp.int64),
+    digits: wp.array(dtype=wp.int64),
+    order: wp.array(dtype=wp.int64),
+    voxel: wp.array2d(dtype=wp.int64),
+    starts: wp.array2d(dtype=wp.int64),
+    cursor: wp.array2d(dtype=wp.int64),
+    counts: wp.array(dtype=wp.int64),
+):
+    # the points inside: keys in row 0 of the work, points in the order; rows 1 and 2 are the other side of a pass
+    kept = int(0)
+    largest = wp.int64(0)
+    for i in range(keys.shape[0]):
+        if keys[i] != wp.int64(OUTSIDE):
+            work[0, kept] = keys[i]
+            order[kept] = wp.int64(i)
+            largest = wp.max(largest, keys[i])
+            kept += 1
+    shift = wp.int64(0)
+    while (largest >> shift) != wp.int64(0):
+        for d in range(DIGITS):
+            digits[d] = wp.int64(0)
+        for i in range(kept):
+            d = int((work[0, i] >> shift) & wp.int64(DIGITS - 1))
+            digits[d] = digits[d] + wp.int64(1)
+        total = wp.int64(0)
+        for d in range(DIGITS):
+            own = digits[d]
+            digits[d] = total
+            total += own
+        for i in range(kept):
+            d = int((work[0, i] >> shift) & wp.int64(DIGITS - 1))
+            at = int(digits[d])
+            digits[d] = wp.int64(at + 1)
+            work[1, at] = work[0, i]
+            work[2, at] = order[i]
+        for i in range(kept):
+            work[0, i] = work[1, i]
+            order[i] = work[2, i]
+        shift += wp.int64(DIGIT_BITS)
+    counts[scales.shape[0]] = wp.int64(kept)
+    for s in range(scales.shape[0]):
+        drop = scales[s, 0]
+        v = int(-1)
+        before = wp.int64(-1)
+        for i in range(kept):
+            key = work[0, i] >> drop
+            if key != before:
+                before = key
+                v += 1
+                inner = key & ((wp.int64(1) << (bits - drop)) - wp.int64(1))
+                row = (key >> (bits - drop)) * scales[s, 1] + _collect(inner >> wp.int64(1))
+                starts[s, v] = wp.int64(i)
+                cursor[s, v] = row * scales[s, 2] + _collect(inner)
+            voxel[s, i] = wp.int64(v)
+        starts[s, v + 1] = wp.int64(kept)
+        counts[s] = wp.int64(v + 1)
 
 
 @wp.kernel(enable_backward=False, module="unique")

@@ -443,3 +443,27 @@ def test_bad_hash_keys(device: torch.device) -> None:
         voxel.hash_index(torch.zeros(3, 1, dtype=torch.int64, device=device))
     with pytest.raises(ValueError, match=r"cursor.*-1"):
         voxel.hash_index(torch.tensor([3, -1], device=device))
+
+
+@pytest.mark.parametrize("scales", [[0.1], [0.1, 0.2, 0.4, 0.8], [0.4, 0.2]])
+@pytest.mark.parametrize("count", [0, 1, 5000])
+def test_one_thread_and_many_give_the_same_index(scales: list[float], count: int, device: torch.device) -> None:
+    """The CPU sorts and walks in one thread, a GPU in many: both ways here, from the same keys."""
+    grids = grids_of(scales)
+    finest = min(grids, key=lambda grid: grid.cell)
+    levels = tuple(voxel._level(grid, finest) for grid in grids)
+    bits = 2 * voxel._bits(finest)
+    generator = torch.Generator().manual_seed(count)
+    keys = torch.randint(3 << bits, (count,), generator=generator)
+    keys[::7] = 1 << 62  # outside
+    of_scales = voxel._scales(tuple(grids), levels, torch.device("cpu"))
+    serial = voxel._serial_index(keys, of_scales, bits)
+    parallel = voxel._parallel_index(keys.to(device), of_scales.to(device), bits)
+    assert torch.equal(serial.counts, parallel.counts.cpu())
+    *voxels, kept = serial.counts.tolist()
+    assert kept == int((keys < 1 << 62).sum())
+    assert torch.equal(serial.order[:kept], parallel.order[:kept].cpu())
+    for s, v in enumerate(voxels):
+        assert torch.equal(serial.voxel[s, :kept], parallel.voxel[s, :kept].cpu())
+        assert torch.equal(serial.starts[s, : v + 1], parallel.starts[s, : v + 1].cpu())
+        assert torch.equal(serial.cursor[s, :v], parallel.cursor[s, :v].cpu())
