@@ -73,7 +73,7 @@ def raycast(
     with on_stream:
         indices = faces.to(torch.int32).contiguous().view(-1)
         # one triangle a leaf answers this many rays fastest: 38 ms against 48 ms for the 37,000 rays of a frame
-        mesh = wp.Mesh(_vectors(vertices), array(indices), bvh_constructor="sah", bvh_leaf_size=1)
+        mesh = wp.Mesh(_vectors(vertices), wp.from_torch(indices), bvh_constructor="sah", bvh_leaf_size=1)
         rays = (mesh.id, _vectors(origins), _vectors(directions), float(max_range))
         launch(_raycast, len(origins), (*rays, array(distance), array(face), _vectors(normal)), vertices.device)
         del mesh

@@ -202,7 +202,7 @@ def _parallel_index(keys: Tensor, of_scales: Tensor, bits: int) -> NestedIndex:
 def _serial_index(keys: Tensor, of_scales: Tensor, bits: int) -> NestedIndex:
     """The same for one thread: a radix sort of the points inside, then one walk over them for all scales."""
     count, scales = len(keys), len(of_scales)
-    order, work = torch.empty(count, dtype=torch.int64), torch.empty(3, count, dtype=torch.int64)
+    order, work = torch.empty(count, dtype=torch.int64), torch.empty(4, count, dtype=torch.int64)
     voxel, cursor = (torch.empty(scales, count, dtype=torch.int64) for _ in range(2))
     starts, counts = torch.empty(scales, count + 1, dtype=torch.int64), torch.zeros(scales + 1, dtype=torch.int64)
     digits = torch.empty(DIGITS, dtype=torch.int64)
@@ -385,21 +385,22 @@ def _serial_kernel(
     cursor: wp.array2d(dtype=wp.int64),
     counts: wp.array(dtype=wp.int64),
 ):
-    # the points inside: keys in row 0 of the work, points in the order; rows 1 and 2 are the other side of a pass
+    # keys in rows 0 and 1 of the work, points in rows 2 and 3: a pass goes from one side to the other
     kept = int(0)
     largest = wp.int64(0)
     for i in range(keys.shape[0]):
         if keys[i] != wp.int64(OUTSIDE):
             work[0, kept] = keys[i]
-            order[kept] = wp.int64(i)
+            work[2, kept] = wp.int64(i)
             largest = wp.max(largest, keys[i])
             kept += 1
+    side = int(0)
     shift = wp.int64(0)
     while (largest >> shift) != wp.int64(0):
         for d in range(DIGITS):
             digits[d] = wp.int64(0)
         for i in range(kept):
-            d = int((work[0, i] >> shift) & wp.int64(DIGITS - 1))
+            d = int((work[side, i] >> shift) & wp.int64(DIGITS - 1))
             digits[d] = digits[d] + wp.int64(1)
         total = wp.int64(0)
         for d in range(DIGITS):
@@ -407,22 +408,23 @@ def _serial_kernel(
             digits[d] = total
             total += own
         for i in range(kept):
-            d = int((work[0, i] >> shift) & wp.int64(DIGITS - 1))
+            key = work[side, i]
+            d = int((key >> shift) & wp.int64(DIGITS - 1))
             at = int(digits[d])
             digits[d] = wp.int64(at + 1)
-            work[1, at] = work[0, i]
-            work[2, at] = order[i]
-        for i in range(kept):
-            work[0, i] = work[1, i]
-            order[i] = work[2, i]
+            work[1 - side, at] = key
+            work[3 - side, at] = work[2 + side, i]
+        side = 1 - side
         shift += wp.int64(DIGIT_BITS)
+    for i in range(kept):
+        order[i] = work[2 + side, i]
     counts[scales.shape[0]] = wp.int64(kept)
     for s in range(scales.shape[0]):
         drop = scales[s, 0]
         v = int(-1)
         before = wp.int64(-1)
         for i in range(kept):
-            key = work[0, i] >> drop
+            key = work[side, i] >> drop
             if key != before:
                 before = key
                 v += 1

@@ -493,7 +493,7 @@ def test_boxes_outside_the_range_and_other_classes_are_dropped(copied: Path, tin
         "DontCare -1 -1 -10 600 150 700 200 -1 -1 -1 -1000 -1000 -1000 -10",
     ]
     (copied / "training" / "label_2" / "000000.txt").write_text("\n".join(lines) + "\n")
-    _, boxes, labels = TrainingFrames(copied, ["000000"], config, None)[0, 0]
+    _, boxes, labels, _ = TrainingFrames(copied, ["000000"], config, None)[0, 0]
     assert labels.tolist() == [0, 2]
     # the camera stands 0.27 m before the LiDAR, and its axes are turned by less than a degree
     torch.testing.assert_close(boxes[:, :2], torch.tensor([[10.3, 0.0], [9.3, -5.0]]), rtol=0, atol=0.2)
