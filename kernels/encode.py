@@ -44,7 +44,7 @@ def attend(
     check_tensor("points", points, (features.dtype,), (features.shape[0], 4), like=features)
     check_tensor("mean", mean, (features.dtype,), (voxels.starts.shape[0] - 1, 4), like=features)
     check_tensor("layer", layer, (features.dtype,), (LAYER, count), like=features)
-    product, values, _ = _attend(features, points, mean, layer, voxels.voxel, voxels.order, voxels.starts, relu, keep)
+    product, values, _ = _attend(features, points, mean, layer, voxels.order, voxels.starts, relu, keep)
     return product, values
 
 
@@ -446,8 +446,7 @@ def _attend(
     features: Tensor,
     points: Tensor,
     mean: Tensor,
-    weight: Tensor,
-    voxel: Tensor,
+    layer: Tensor,
     order: Tensor | None,
     starts: Tensor,
     relu: bool,
@@ -461,7 +460,7 @@ def _attend(
         channels(features.contiguous(), lanes),
         array(points.contiguous(), 4),
         array(mean.contiguous(), 4),
-        channels(weight.contiguous(), lanes),
+        channels(layer.contiguous(), lanes),
         array(starts.new_empty(0) if order is None else order.contiguous()),
         array(starts.contiguous()),
         int(relu),
@@ -477,8 +476,7 @@ def _(
     features: Tensor,
     points: Tensor,
     mean: Tensor,
-    weight: Tensor,
-    voxel: Tensor,
+    layer: Tensor,
     order: Tensor | None,
     starts: Tensor,
     relu: bool,
@@ -496,7 +494,7 @@ def _attend_backward(
     features: Tensor,
     points: Tensor,
     mean: Tensor,
-    weight: Tensor,
+    layer: Tensor,
     order: Tensor | None,
     starts: Tensor,
     argmax: Tensor,
@@ -505,7 +503,7 @@ def _attend_backward(
     count, lanes = features.shape[1], lanes_of(features.shape[1])
     blocks = -(-mean.shape[0] // VOXELS)
     grad_features = features.new_empty(features.shape)
-    grad_weight = features.new_empty(blocks, LAYER, count)
+    grad_layer = features.new_empty(blocks, LAYER, count)
     given = features.new_empty(0, count) if grad_product is None else grad_product.contiguous()
     inputs = [
         channels(given, lanes),
@@ -513,16 +511,16 @@ def _attend_backward(
         channels(features.contiguous(), lanes),
         array(points.contiguous(), 4),
         array(mean.contiguous(), 4),
-        channels(weight.contiguous(), lanes),
+        channels(layer.contiguous(), lanes),
         array(starts.new_empty(0) if order is None else order.contiguous()),
         array(starts.contiguous()),
         channels(argmax, lanes),
         int(relu),
         channels(grad_features, lanes),
-        array(grad_weight.view(blocks, LAYER, count // lanes, lanes), lanes),
+        array(grad_layer.view(blocks, LAYER, count // lanes, lanes), lanes),
     ]
     launch(_kernels(WARP_FLOAT[features.dtype], lanes).backward, (blocks, count // lanes), inputs, features.device)
-    return grad_features, grad_weight.sum(dim=0)
+    return grad_features, grad_layer.sum(dim=0)
 
 
 @_attend_backward.register_fake
@@ -532,13 +530,13 @@ def _(
     features: Tensor,
     points: Tensor,
     mean: Tensor,
-    weight: Tensor,
+    layer: Tensor,
     order: Tensor | None,
     starts: Tensor,
     argmax: Tensor,
     relu: bool,
 ) -> tuple[Tensor, Tensor]:
-    return features.new_empty(features.shape), torch.empty_like(weight)
+    return features.new_empty(features.shape), torch.empty_like(layer)
 
 
 def _save(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:
@@ -549,14 +547,14 @@ def _save(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> Non
 
 
 def _backward(ctx: Any, grad_product: Tensor | None, grad_values: Tensor | None, _: Any) -> tuple[Tensor | None, ...]:
-    features, points, mean, weight, _, order, starts, argmax = ctx.saved_tensors
+    features, points, mean, layer, order, starts, argmax = ctx.saved_tensors
     if grad_values is None:
         grad_values = features.new_zeros(mean.shape[0], features.shape[1])
     given = grad_product if ctx.keep else None
-    grad_features, grad_weight = _attend_backward(
-        given, grad_values, features, points, mean, weight, order, starts, argmax, ctx.relu
+    grad_features, grad_layer = _attend_backward(
+        given, grad_values, features, points, mean, layer, order, starts, argmax, ctx.relu
     )
-    return grad_features, None, None, grad_weight, None, None, None, None, None
+    return grad_features, None, None, grad_layer, None, None, None, None
 
 
 _attend.register_autograd(_backward, setup_context=_save)
