@@ -683,7 +683,7 @@ def make_frame(seed: int, index: int, options: Options) -> tuple[Scene, Scan, La
 def generate(root: Path, frames_train: int, frames_val: int, seed: int, options: Options | None = None) -> None:
     """Writes scenes as a KITTI root: frames 0 to frames_train - 1 for training, the next frames_val for validation.
 
-    A folder that holds these very scenes is left as it is, one with a part of them is completed, any other that is not
+    A folder that holds these very scenes is left as it is, one with a part of them is written anew, any other that is not
     empty is refused.
     """
     root, options = Path(root), options or Options()
@@ -751,7 +751,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     default = Options()
-    parser.add_argument("--out", type=Path, required=True, help="folder to write; it must be new or empty")
+    parser.add_argument(
+        "--out", type=Path, required=True, default=argparse.SUPPRESS, help="folder to write; it must be new or empty"
+    )
     parser.add_argument("--train", type=int, default=200, help="frames of the training split")
     parser.add_argument("--val", type=int, default=40, help="frames of the validation split")
     parser.add_argument("--seed", type=int, default=0, help="frame k depends on the seed and k alone")
