@@ -170,18 +170,18 @@ def nested_index(points: Tensor, sample: Tensor, grids: Sequence[Grid]) -> Neste
     """The voxels of points (N, 4) float32 of samples (N,) int64 in grids that nest; nothing is read from the device."""
     finest = min(grids, key=lambda grid: grid.cell)
     levels = [_level(grid, finest) or 0 for grid in grids]
-    bits, count, device = _bits(finest), len(points), points.device
-    keys = torch.empty(count, dtype=torch.int64, device=device)
+    bits, device = 2 * _bits(finest), points.device
     # inside every grid: the finest index, cut to a coarser grid's cells, is compared with each
     cells = wp.vec2i(*(min(g.cells[axis] << level for g, level in zip(grids, levels, strict=True)) for axis in (0, 1)))
     height = wp.vec2(max(grid.z_min for grid in grids), min(grid.z_max for grid in grids))
     low, reciprocal = wp.vec2(finest.x_min, finest.y_min), wp.vec2(1.0 / finest.cell[0], 1.0 / finest.cell[1])
-    inputs = [array(points.contiguous()), array(sample.contiguous()), low, height, reciprocal, cells]
-    launch(_key_kernel, count, [*inputs, wp.int64(2 * bits), array(keys)], device)
+    inputs = [array(points.contiguous()), array(sample.contiguous()), low, height, reciprocal, cells, wp.int64(bits)]
     of_scales = _scales(tuple(grids), tuple(levels), device)
-    return (
-        _serial_index(keys, of_scales, 2 * bits) if device.type == "cpu" else _parallel_index(keys, of_scales, 2 * bits)
-    )
+    if device.type == "cpu":
+        return _serial_index(inputs, len(points), of_scales)
+    keys = torch.empty(len(points), dtype=torch.int64, device=device)
+    launch(_key_kernel, len(points), [*inputs, array(keys)], device)
+    return _parallel_index(keys, of_scales, bits)
 
 
 def _parallel_index(keys: Tensor, of_scales: Tensor, bits: int) -> NestedIndex:
@@ -199,15 +199,15 @@ def _parallel_index(keys: Tensor, of_scales: Tensor, bits: int) -> NestedIndex:
     return NestedIndex(order, voxel, starts, cursor, counts)
 
 
-def _serial_index(keys: Tensor, of_scales: Tensor, bits: int) -> NestedIndex:
+def _serial_index(inputs: list[object], count: int, of_scales: Tensor) -> NestedIndex:
     """The same for one thread: a radix sort of the points inside, then one walk over them for all scales."""
-    count, scales = len(keys), len(of_scales)
+    scales = len(of_scales)
     order, work = torch.empty(count, dtype=torch.int64), torch.empty(4, count, dtype=torch.int64)
     voxel, cursor = (torch.empty(scales, count, dtype=torch.int64) for _ in range(2))
     starts, counts = torch.empty(scales, count + 1, dtype=torch.int64), torch.zeros(scales + 1, dtype=torch.int64)
-    digits = torch.empty(DIGITS, dtype=torch.int64)
-    inputs = [array(tensor) for tensor in (keys, of_scales, work, digits, order, voxel, starts, cursor, counts)]
-    launch(_serial_kernel, 1, [wp.int64(bits), *inputs], keys.device)
+    digits = torch.zeros(DIGITS, dtype=torch.int64)
+    outputs = [array(tensor) for tensor in (of_scales, work, digits, order, voxel, starts, cursor, counts)]
+    launch(_serial_kernel, 1, [*inputs, *outputs], order.device)
     return NestedIndex(order, voxel, starts, cursor, counts)
 
 
@@ -311,6 +311,26 @@ def _collect(value: wp.int64):
     return (v | (v >> wp.int64(16))) & wp.int64(0x7FFFFFFF)
 
 
+@wp.func
+def _key(
+    points: wp.array2d(dtype=wp.float32),
+    sample: wp.array(dtype=wp.int64),
+    i: int,
+    low: wp.vec2,
+    height: wp.vec2,
+    reciprocal: wp.vec2,
+    cells: wp.vec2i,
+    bits: wp.int64,
+):
+    """The Morton key of a point, below its sample; OUTSIDE for a point that is not inside."""
+    x = wp.floor((points[i, 0] - low[0]) * reciprocal[0])
+    y = wp.floor((points[i, 1] - low[1]) * reciprocal[1])
+    key = wp.int64(OUTSIDE)
+    if _is_inside(x, y, points[i, 2], points[i, 3], height, cells):
+        key = (sample[i] << bits) | (_spread(wp.int64(x)) << wp.int64(1)) | _spread(wp.int64(y))
+    return key
+
+
 @wp.kernel(enable_backward=False, module="unique")
 def _key_kernel(
     points: wp.array2d(dtype=wp.float32),
@@ -323,13 +343,7 @@ def _key_kernel(
     keys: wp.array(dtype=wp.int64),
 ):
     i = wp.tid()
-    x = wp.floor((points[i, 0] - low[0]) * reciprocal[0])
-    y = wp.floor((points[i, 1] - low[1]) * reciprocal[1])
-    z = points[i, 2]
-    key = wp.int64(OUTSIDE)
-    if _is_inside(x, y, z, points[i, 3], height, cells):
-        key = (sample[i] << bits) | (_spread(wp.int64(x)) << wp.int64(1)) | _spread(wp.int64(y))
-    keys[i] = key
+    keys[i] = _key(points, sample, i, low, height, reciprocal, cells, bits)
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -374,8 +388,13 @@ def _fill_kernel(
 
 @wp.kernel(enable_backward=False, module="unique")
 def _serial_kernel(
+    points: wp.array2d(dtype=wp.float32),
+    sample: wp.array(dtype=wp.int64),
+    low: wp.vec2,
+    height: wp.vec2,
+    reciprocal: wp.vec2,
+    cells: wp.vec2i,
     bits: wp.int64,
-    keys: wp.array(dtype=wp.int64),
     scales: wp.array2d(dtype=wp.int64),
     work: wp.array2d(dtype=wp.int64),
     digits: wp.array(dtype=wp.int64),
@@ -388,20 +407,18 @@ def _serial_kernel(
     # keys in rows 0 and 1 of the work, points in rows 2 and 3: a pass goes from one side to the other
     kept = int(0)
     largest = wp.int64(0)
-    for i in range(keys.shape[0]):
-        if keys[i] != wp.int64(OUTSIDE):
-            work[0, kept] = keys[i]
+    for i in range(points.shape[0]):
+        key = _key(points, sample, i, low, height, reciprocal, cells, bits)
+        if key != wp.int64(OUTSIDE):
+            work[0, kept] = key
             work[2, kept] = wp.int64(i)
-            largest = wp.max(largest, keys[i])
+            largest = wp.max(largest, key)
             kept += 1
+            d = int(key & wp.int64(DIGITS - 1))
+            digits[d] = digits[d] + wp.int64(1)
     side = int(0)
     shift = wp.int64(0)
     while (largest >> shift) != wp.int64(0):
-        for d in range(DIGITS):
-            digits[d] = wp.int64(0)
-        for i in range(kept):
-            d = int((work[side, i] >> shift) & wp.int64(DIGITS - 1))
-            digits[d] = digits[d] + wp.int64(1)
         total = wp.int64(0)
         for d in range(DIGITS):
             own = digits[d]
@@ -416,6 +433,12 @@ def _serial_kernel(
             work[3 - side, at] = work[2 + side, i]
         side = 1 - side
         shift += wp.int64(DIGIT_BITS)
+        if (largest >> shift) != wp.int64(0):
+            for d in range(DIGITS):
+                digits[d] = wp.int64(0)
+            for i in range(kept):
+                d = int((work[side, i] >> shift) & wp.int64(DIGITS - 1))
+                digits[d] = digits[d] + wp.int64(1)
     for i in range(kept):
         order[i] = work[2 + side, i]
     counts[scales.shape[0]] = wp.int64(kept)

@@ -448,20 +448,25 @@ def test_bad_hash_keys(device: torch.device) -> None:
 @pytest.mark.parametrize("scales", [[0.1], [0.1, 0.2, 0.4, 0.8], [0.4, 0.2]])
 @pytest.mark.parametrize("count", [0, 1, 5000])
 def test_one_thread_and_many_give_the_same_index(scales: list[float], count: int, device: torch.device) -> None:
-    """The CPU sorts and walks in one thread, a GPU in many: both ways here, from the same keys."""
+    """The CPU sorts and walks in one thread, a GPU in many: here the way of the GPU, from keys made by hand."""
     grids = grids_of(scales)
     finest = min(grids, key=lambda grid: grid.cell)
-    levels = tuple(voxel._level(grid, finest) for grid in grids)
-    bits = 2 * voxel._bits(finest)
-    generator = torch.Generator().manual_seed(count)
-    keys = torch.randint(3 << bits, (count,), generator=generator)
-    keys[::7] = 1 << 62  # outside
-    of_scales = voxel._scales(tuple(grids), levels, torch.device("cpu"))
-    serial = voxel._serial_index(keys, of_scales, bits)
-    parallel = voxel._parallel_index(keys.to(device), of_scales.to(device), bits)
+    bits = voxel._bits(finest)
+    points, sample = cloud(count), torch.arange(count) % 3
+    cursor = voxel.cursors(points, sample, finest)
+    n_l, n_w = finest.shape
+    keys = cursor // (n_l * n_w) << 2 * bits
+    for bit in range(bits):
+        keys |= (cursor // n_w % n_l >> bit & 1) << 2 * bit + 1 | (cursor % n_w >> bit & 1) << 2 * bit
+    for grid in grids:  # a coarser grid may reach further than the finest, none less far
+        assert (voxel.cursors(points, sample, grid) >= 0)[cursor >= 0].all()
+    keys[cursor < 0] = 1 << 62
+    of_scales = voxel._scales(tuple(grids), tuple(voxel._level(grid, finest) for grid in grids), device)
+    parallel = voxel._parallel_index(keys.to(device), of_scales, 2 * bits)
+    serial = voxel.nested_index(points, sample, grids)
     assert torch.equal(serial.counts, parallel.counts.cpu())
     *voxels, kept = serial.counts.tolist()
-    assert kept == int((keys < 1 << 62).sum())
+    assert kept == int((cursor >= 0).sum())
     assert torch.equal(serial.order[:kept], parallel.order[:kept].cpu())
     for s, v in enumerate(voxels):
         assert torch.equal(serial.voxel[s, :kept], parallel.voxel[s, :kept].cpu())

@@ -683,8 +683,8 @@ def make_frame(seed: int, index: int, options: Options) -> tuple[Scene, Scan, La
 def generate(root: Path, frames_train: int, frames_val: int, seed: int, options: Options | None = None) -> None:
     """Writes scenes as a KITTI root: frames 0 to frames_train - 1 for training, the next frames_val for validation.
 
-    A folder that holds these very scenes is left as it is, one with a part of them is written anew, any other that is not
-    empty is refused.
+    A folder that holds these very scenes is left as it is, one with a part of them is written anew, and any other that
+    is not empty is refused.
     """
     root, options = Path(root), options or Options()
     _check(frames_train, frames_val, seed, options)
