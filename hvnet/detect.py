@@ -130,9 +130,8 @@ def read_source(source: Source, classes: Sequence[str]) -> Cloud:
         return Cloud(torch.from_numpy(points), torch.zeros(0, 7), None, (0, 0), notes)
     labelled = source.kitti_file("label_2", ".txt") is not None
     frame = read_frame(source.path, source.name, source.split_dir, labelled=labelled)
-    notes = [f"frame {frame.id}: {frame.dropped} points that are not finite were dropped"] if frame.dropped else []
     truth = frame.boxes[[name in classes for name in frame.names]]
-    return Cloud(frame.points, truth, frame.calib, frame.image_size, notes)
+    return Cloud(frame.points, truth, frame.calib, frame.image_size, [frame.note] if frame.note else [])
 
 
 def result_rows(found: Detections, cloud: Cloud, classes: Sequence[str]) -> Labels:

@@ -221,7 +221,10 @@ class FusedEncoder:
         encoder, avfe, avfeo = self.encoder, self.encoder.avfe, self.encoder.avfeo
         grids = list(dict.fromkeys(encoder.feature_grids + encoder.projection_grids))
         if not is_nested(grids, batch_size):
-            return [image.to(dtype) for image in encoder.eval()(points, sample, batch_size)]
+            training = encoder.training
+            images = encoder.eval()(points, sample, batch_size)
+            encoder.train(training)
+            return [image.to(dtype) for image in images]
         index = nested_index(points, sample, grids)
         parts, kept, rows = scales_of(index)
         points = points[index.order[:rows]]

@@ -35,8 +35,6 @@ from hvnet.evaluate import CLASSES, evaluate, format_table
 from hvnet.model import HVNet, load_checkpoint, save_checkpoint, select_device
 
 DEMO = Path(__file__).resolve().parent.parent / "configs" / "demo.yaml"
-
-
 CHANGEABLE = [f"train.{key}" for key in ("epochs", "learning_rate", "validate_every", "pictures", "workers")]
 """What may differ from the run that --resume takes up."""
 
@@ -79,7 +77,7 @@ class TrainingFrames(Dataset[Sample]):
         )
         low, high = boxes.new_tensor(self.config.encoder.point_range).view(2, 3)
         inside = ((boxes[:, :2] >= low[:2]) & (boxes[:, :2] < high[:2])).all(dim=1) & (labels >= 0)
-        return points, boxes[inside], labels[inside], note(frame)
+        return points, boxes[inside], labels[inside], frame.note
 
 
 class EpochOrder(Sampler[tuple[int, int]]):
@@ -102,11 +100,6 @@ def seeded(*numbers: int) -> torch.Generator:
     for number in numbers:
         seed = (seed * 6364136223846793005 + number + 1442695040888963407) % 2**63
     return torch.Generator().manual_seed(seed)
-
-
-def note(frame: Frame) -> str:
-    """What a user should know of a frame's points; empty if nothing."""
-    return f"frame {frame.id}: {frame.dropped} points that are not finite were dropped" if frame.dropped else ""
 
 
 def say_once(notes: list[str], said: set[str]) -> None:
@@ -180,7 +173,7 @@ def validate(model: HVNet, root: Path, ids: list[str], pictures: Path, said: set
     labels, predictions = [], []
     for k, name in enumerate(tqdm(ids, desc="validating", unit="frame", leave=False, dynamic_ncols=True)):
         frame = read_frame(root, name)
-        say_once([note(frame)], said)
+        say_once([frame.note], said)
         points = frame.points.to(device)
         sample = torch.zeros(len(points), dtype=torch.int64, device=device)
         found = model.detect(points, sample, 1)[0]

@@ -95,7 +95,10 @@ def voxel_means(points: Tensor, scale: Scale) -> Tensor:
 def encode_voxels(
     features: Tensor, points: Tensor, mean: Tensor, weight: Tensor, scale: Scale, relu: bool, product: Tensor, part: int
 ) -> Tensor:
-    """`attend` without gradients: writes M to the part-th C columns of product (N, T C), returns G' (rows, C)."""
+    """`attend` without gradients: writes M to the part-th C columns of product (N, T C), returns G' (rows, C).
+
+    The weight (9, C) is that of g and its bias; the batch norm of the features (N, C) is in them already.
+    """
     count = features.shape[1]
     lanes = lanes_of(count)
     values = features.new_empty(scale.rows, count)
@@ -118,7 +121,10 @@ def add_of_voxels(features: Tensor, of_voxels: Tensor, voxel: Tensor, kept: Tens
 def project_voxels(
     features: Tensor, points: Tensor, mean: Tensor, weight: Tensor, scale: Scale, relu: bool, image: Tensor
 ) -> None:
-    """`attend` and Eq. 3 without gradients: writes G' to the cells of the image (B N_L N_W, C), float of any width."""
+    """`attend` and Eq. 3 without gradients: writes G' to the cells of the image (B N_L N_W, C), float of any width.
+
+    The weight (9, C) is that of g and its bias; the batch norm of the features (N, C) is in them already.
+    """
     count = features.shape[1]
     lanes = lanes_of(count)
     inputs = [channels(features, lanes), array(points, 4), array(mean, 4), channels(weight, lanes)]

@@ -118,6 +118,11 @@ class Frame:
     image_size: tuple[int, int]  # width, height in pixels
     dropped: int  # points of the file that were not finite
 
+    @property
+    def note(self) -> str:
+        """What a user should know of the frame's points; empty if nothing."""
+        return f"frame {self.id}: {self.dropped} points that are not finite were dropped" if self.dropped else ""
+
 
 def read_frame(
     root: Path, frame_id: str, split_dir: str = "training", crop: bool = True, labelled: bool = True
