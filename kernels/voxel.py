@@ -13,6 +13,7 @@ from hvnet.kernels.launch import array, check_index, check_tensor, launch
 from hvnet.kernels.scatter import Segments, segments
 
 KEY_BITS = 62  # of a sort key in int64
+AXIS_BITS = 16  # of a key for either axis: 6.5 km of 0.1 m cells
 DIGIT_BITS = wp.constant(11)  # of a pass of the radix sort
 DIGITS = wp.constant(1 << 11)
 OUTSIDE = wp.constant(1 << 62)  # the key of a point outside, after all others
@@ -85,7 +86,7 @@ def cursors(points: Tensor, sample: Tensor, grid: Grid) -> Tensor:
     _check_points(points, sample)
     cursor = torch.empty(len(points), dtype=torch.int64, device=points.device)
     inputs = [
-        array(points.contiguous()),
+        array(points.contiguous(), 4),
         array(sample.contiguous()),
         wp.vec2(grid.x_min, grid.y_min),
         wp.vec2(grid.z_min, grid.z_max),
@@ -104,7 +105,7 @@ def voxel_index(points: Tensor, sample: Tensor, batch_size: int, grids: Sequence
 
     A point is kept iff it is inside every grid. Where each cell is a power of two times the finest, one sort by the
     Morton key of the finest grid makes every voxel of every scale a run of consecutive points; other scales, and grids
-    too large for a key, go through the hash table.
+    too large for a key (more than 65,536 cells a side), go through the hash table.
     """
     _check_points(points, sample)
     if not grids:
@@ -162,7 +163,7 @@ def _grids(flat: Sequence[float]) -> list[Grid]:
 def is_nested(grids: Sequence[Grid], batch_size: int) -> bool:
     """Whether one sort serves all grids: each cell a power of two times the finest, to the bit, and keys that fit."""
     finest = min(grids, key=lambda grid: grid.cell)
-    fits = 2 * _bits(finest) + batch_size.bit_length() <= KEY_BITS
+    fits = _bits(finest) <= AXIS_BITS and 2 * _bits(finest) + batch_size.bit_length() <= KEY_BITS
     return fits and all(_level(grid, finest) is not None for grid in grids)
 
 
@@ -175,7 +176,7 @@ def nested_index(points: Tensor, sample: Tensor, grids: Sequence[Grid]) -> Neste
     cells = wp.vec2i(*(min(g.cells[axis] << level for g, level in zip(grids, levels, strict=True)) for axis in (0, 1)))
     height = wp.vec2(max(grid.z_min for grid in grids), min(grid.z_max for grid in grids))
     low, reciprocal = wp.vec2(finest.x_min, finest.y_min), wp.vec2(1.0 / finest.cell[0], 1.0 / finest.cell[1])
-    inputs = [array(points.contiguous()), array(sample.contiguous()), low, height, reciprocal, cells, wp.int64(bits)]
+    inputs = [array(points.contiguous(), 4), array(sample.contiguous()), low, height, reciprocal, cells, wp.int64(bits)]
     of_scales = _scales(tuple(grids), tuple(levels), device)
     if device.type == "cpu":
         return _serial_index(inputs, len(points), of_scales)
@@ -261,15 +262,15 @@ def _check_points(points: Tensor, sample: Tensor) -> None:
 
 
 @wp.func
-def _is_inside(x: float, y: float, z: float, reflectance: float, height: wp.vec2, cells: wp.vec2i):
-    """Whether the index (x, y) is a cell and z in range. Infinities and NaN fail as floats and are never cast."""
+def _is_inside(point: wp.vec4, x: float, y: float, height: wp.vec2, cells: wp.vec2i):
+    """Whether (x, y) in cells is in the grid, z in range and the reflectance finite; NaN fails every comparison."""
     inside = x >= 0.0 and x < float(cells[0]) and y >= 0.0 and y < float(cells[1])
-    return inside and z >= height[0] and z < height[1] and wp.isfinite(reflectance)
+    return inside and point[2] >= height[0] and point[2] < height[1] and wp.abs(point[3]) < wp.inf
 
 
 @wp.kernel(enable_backward=False, module="unique")
 def _cursor_kernel(
-    points: wp.array2d(dtype=wp.float32),
+    points: wp.array(dtype=wp.vec4),
     sample: wp.array(dtype=wp.int64),
     low: wp.vec2,
     height: wp.vec2,
@@ -280,40 +281,40 @@ def _cursor_kernel(
     cursor: wp.array(dtype=wp.int64),
 ):
     i = wp.tid()
-    x = wp.floor((points[i, 0] - low[0]) * reciprocal[0])
-    y = wp.floor((points[i, 1] - low[1]) * reciprocal[1])
-    z = points[i, 2]
+    x = (points[i][0] - low[0]) * reciprocal[0]
+    y = (points[i][1] - low[1]) * reciprocal[1]
     value = wp.int64(-1)
-    if _is_inside(x, y, z, points[i, 3], height, cells):
+    if _is_inside(points[i], x, y, height, cells):
         value = (sample[i] * n_l + wp.int64(x)) * n_w + wp.int64(y)
     cursor[i] = value
 
 
 @wp.func
-def _spread(value: wp.int64):
-    """The 31 low bits of a value, one place apart."""
-    v = value
-    v = (v | (v << wp.int64(16))) & wp.int64(0x0000FFFF0000FFFF)
+def _interleave(x: wp.int64, y: wp.int64):
+    """The Morton code of two values of 16 bits: both are spread at once, each in its half of the word."""
+    v = (x << wp.int64(32)) | y
     v = (v | (v << wp.int64(8))) & wp.int64(0x00FF00FF00FF00FF)
     v = (v | (v << wp.int64(4))) & wp.int64(0x0F0F0F0F0F0F0F0F)
     v = (v | (v << wp.int64(2))) & wp.int64(0x3333333333333333)
-    return (v | (v << wp.int64(1))) & wp.int64(0x5555555555555555)
+    v = (v | (v << wp.int64(1))) & wp.int64(0x5555555555555555)
+    return (v | (v >> wp.int64(31))) & wp.int64(0xFFFFFFFF)
 
 
 @wp.func
-def _collect(value: wp.int64):
-    """Every other bit of a value, side by side: the inverse of _spread."""
-    v = value & wp.int64(0x5555555555555555)
+def _cursor_of_key(key: wp.int64, bits: wp.int64, n_l: wp.int64, n_w: wp.int64):
+    """Eq. 1 for a key of `bits` bits below its sample: the inverse of _interleave."""
+    code = key & ((wp.int64(1) << bits) - wp.int64(1))
+    v = (code | (code << wp.int64(31))) & wp.int64(0x5555555555555555)
     v = (v | (v >> wp.int64(1))) & wp.int64(0x3333333333333333)
     v = (v | (v >> wp.int64(2))) & wp.int64(0x0F0F0F0F0F0F0F0F)
     v = (v | (v >> wp.int64(4))) & wp.int64(0x00FF00FF00FF00FF)
     v = (v | (v >> wp.int64(8))) & wp.int64(0x0000FFFF0000FFFF)
-    return (v | (v >> wp.int64(16))) & wp.int64(0x7FFFFFFF)
+    return ((key >> bits) * n_l + (v >> wp.int64(32))) * n_w + (v & wp.int64(0xFFFF))
 
 
 @wp.func
 def _key(
-    points: wp.array2d(dtype=wp.float32),
+    points: wp.array(dtype=wp.vec4),
     sample: wp.array(dtype=wp.int64),
     i: int,
     low: wp.vec2,
@@ -323,17 +324,17 @@ def _key(
     bits: wp.int64,
 ):
     """The Morton key of a point, below its sample; OUTSIDE for a point that is not inside."""
-    x = wp.floor((points[i, 0] - low[0]) * reciprocal[0])
-    y = wp.floor((points[i, 1] - low[1]) * reciprocal[1])
+    x = (points[i][0] - low[0]) * reciprocal[0]
+    y = (points[i][1] - low[1]) * reciprocal[1]
     key = wp.int64(OUTSIDE)
-    if _is_inside(x, y, points[i, 2], points[i, 3], height, cells):
-        key = (sample[i] << bits) | (_spread(wp.int64(x)) << wp.int64(1)) | _spread(wp.int64(y))
+    if _is_inside(points[i], x, y, height, cells):
+        key = (sample[i] << bits) | _interleave(wp.int64(x), wp.int64(y))
     return key
 
 
 @wp.kernel(enable_backward=False, module="unique")
 def _key_kernel(
-    points: wp.array2d(dtype=wp.float32),
+    points: wp.array(dtype=wp.vec4),
     sample: wp.array(dtype=wp.int64),
     low: wp.vec2,
     height: wp.vec2,
@@ -373,12 +374,9 @@ def _fill_kernel(
         return
     v = int(voxel[s, i])
     if i == 0 or voxel[s, i] != voxel[s, i - 1]:
-        inner = keys[i] & ((wp.int64(1) << bits) - wp.int64(1))
-        level = scales[s, 0] / wp.int64(2)
-        x = _collect(inner >> wp.int64(1)) >> level
-        y = _collect(inner) >> level
+        drop = scales[s, 0]
         starts[s, v] = wp.int64(i)
-        cursor[s, v] = ((keys[i] >> bits) * scales[s, 1] + x) * scales[s, 2] + y
+        cursor[s, v] = _cursor_of_key(keys[i] >> drop, bits - drop, scales[s, 1], scales[s, 2])
     if i + 1 == keys.shape[0] or keys[i + 1] == wp.int64(OUTSIDE):
         starts[s, v + 1] = wp.int64(i + 1)
         counts[s] = wp.int64(v + 1)
@@ -388,7 +386,7 @@ def _fill_kernel(
 
 @wp.kernel(enable_backward=False, module="unique")
 def _serial_kernel(
-    points: wp.array2d(dtype=wp.float32),
+    points: wp.array(dtype=wp.vec4),
     sample: wp.array(dtype=wp.int64),
     low: wp.vec2,
     height: wp.vec2,
@@ -404,18 +402,22 @@ def _serial_kernel(
     cursor: wp.array2d(dtype=wp.int64),
     counts: wp.array(dtype=wp.int64),
 ):
-    # keys in rows 0 and 1 of the work, points in rows 2 and 3: a pass goes from one side to the other
+    # keys in rows 0 and 1 of the work, points in rows 2 and 3: a pass goes from one side to the other. The loops write
+    # whether or not a point counts and move on only if it does: a branch that chance decides costs more than a write
+    # (and `while` compiles to a plainer loop than `range`)
     kept = int(0)
     largest = wp.int64(0)
-    for i in range(points.shape[0]):
+    i = int(0)
+    while i < points.shape[0]:
         key = _key(points, sample, i, low, height, reciprocal, cells, bits)
+        work[0, kept] = key
+        work[2, kept] = wp.int64(i)
         if key != wp.int64(OUTSIDE):
-            work[0, kept] = key
-            work[2, kept] = wp.int64(i)
-            largest = wp.max(largest, key)
             kept += 1
+            largest = wp.max(largest, key)
             d = int(key & wp.int64(DIGITS - 1))
             digits[d] = digits[d] + wp.int64(1)
+        i += 1
     side = int(0)
     shift = wp.int64(0)
     while (largest >> shift) != wp.int64(0):
@@ -424,40 +426,49 @@ def _serial_kernel(
             own = digits[d]
             digits[d] = total
             total += own
-        for i in range(kept):
+        i = int(0)
+        while i < kept:
             key = work[side, i]
             d = int((key >> shift) & wp.int64(DIGITS - 1))
             at = int(digits[d])
             digits[d] = wp.int64(at + 1)
             work[1 - side, at] = key
             work[3 - side, at] = work[2 + side, i]
+            i += 1
         side = 1 - side
         shift += wp.int64(DIGIT_BITS)
         if (largest >> shift) != wp.int64(0):
             for d in range(DIGITS):
                 digits[d] = wp.int64(0)
-            for i in range(kept):
+            i = int(0)
+            while i < kept:
                 d = int((work[side, i] >> shift) & wp.int64(DIGITS - 1))
                 digits[d] = digits[d] + wp.int64(1)
-    for i in range(kept):
+                i += 1
+    i = int(0)
+    while i < kept:
         order[i] = work[2 + side, i]
+        i += 1
     counts[scales.shape[0]] = wp.int64(kept)
     for s in range(scales.shape[0]):
         drop = scales[s, 0]
         v = int(-1)
         before = wp.int64(-1)
-        for i in range(kept):
+        starts[s, 0] = wp.int64(0)
+        i = int(0)
+        while i < kept:
             key = work[side, i] >> drop
-            if key != before:
-                before = key
-                v += 1
-                inner = key & ((wp.int64(1) << (bits - drop)) - wp.int64(1))
-                row = (key >> (bits - drop)) * scales[s, 1] + _collect(inner >> wp.int64(1))
-                starts[s, v] = wp.int64(i)
-                cursor[s, v] = row * scales[s, 2] + _collect(inner)
+            v += wp.where(key == before, 0, 1)
+            before = key
             voxel[s, i] = wp.int64(v)
-        starts[s, v + 1] = wp.int64(kept)
+            cursor[s, v] = key
+            i += 1
+            starts[s, v + 1] = wp.int64(i)
         counts[s] = wp.int64(v + 1)
+        u = int(0)
+        while u <= v:
+            cursor[s, u] = _cursor_of_key(cursor[s, u], bits - drop, scales[s, 1], scales[s, 2])
+            u += 1
 
 
 @wp.kernel(enable_backward=False, module="unique")
