@@ -169,6 +169,16 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         return (p[0] - mean[0]) * w0 + (p[1] - mean[1]) * w1 + (p[2] - mean[2]) * w2 + p[3] * w3
 
     @wp.func
+    def attended(row: vec, attention: vec, relu: int):
+        """The product of a row of features and its attention."""
+        a = attention
+        b = row
+        if relu != 0:
+            a = wp.max(a, vec())
+            b = wp.max(b, vec())
+        return wp.cw_mul(b, a)
+
+    @wp.func
     def point_at(order: wp.array(dtype=wp.int64), k: int):
         i = k
         if order.shape[0] > 0:
@@ -199,11 +209,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         for k in range(start, int(starts[voxel + 1])):
             i = point_at(order, k)
             attention = shared + of_point(w0, w1, w2, w3, points[i], centre)
-            row = wp.cw_mul(features[i, c], scale) + shift
-            if relu != 0:
-                attention = wp.max(attention, vec())
-                row = wp.max(row, vec())
-            row = wp.cw_mul(row, attention)
+            row = attended(wp.cw_mul(features[i, c], scale) + shift, attention, relu)
             if product.shape[0] > 0:
                 product[i, c] = row
             if k == start:
@@ -317,11 +323,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         best = vec()
         for i in range(start, int(starts[voxel + 1])):
             attention = shared + of_point(w0, w1, w2, w3, points[i], centre)
-            row = features[i, c]
-            if relu != 0:
-                attention = wp.max(attention, vec())
-                row = wp.max(row, vec())
-            row = wp.cw_mul(row, attention)
+            row = attended(features[i, c], attention, relu)
             product[i, column + c] = row
             if i == start:
                 best = row
@@ -343,7 +345,13 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         squares[block, c] = b
 
     return SimpleNamespace(
-        forward=forward, backward=backward, encode=encode, sums=sums, of_voxel=of_voxel, of_point=of_point
+        forward=forward,
+        backward=backward,
+        encode=encode,
+        sums=sums,
+        of_voxel=of_voxel,
+        of_point=of_point,
+        attended=attended,
     )
 
 
@@ -353,7 +361,7 @@ def _project_kernel(lanes: int, image_dtype: Any) -> wp.Kernel:
     vec = wp.types.vector(length=lanes, dtype=wp.float32)
     pixel = wp.types.vector(length=lanes, dtype=image_dtype)
     kernels = _kernels(wp.float32, lanes)
-    of_voxel, of_point = kernels.of_voxel, kernels.of_point
+    of_voxel, of_point, attended = kernels.of_voxel, kernels.of_point, kernels.attended
 
     @wp.kernel(enable_backward=False, module=wp.Module(f"hvnet_project_{image_dtype.__name__}_{lanes}", None))
     def project(
@@ -377,11 +385,7 @@ def _project_kernel(lanes: int, image_dtype: Any) -> wp.Kernel:
         best = vec()
         for i in range(start, int(starts[voxel + 1])):
             attention = shared + of_point(w0, w1, w2, w3, points[i], centre)
-            row = features[i, c]
-            if relu != 0:
-                attention = wp.max(attention, vec())
-                row = wp.max(row, vec())
-            row = wp.cw_mul(row, attention)
+            row = attended(features[i, c], attention, relu)
             if i == start:
                 best = row
             best = wp.max(best, row)

@@ -12,8 +12,7 @@ from torch import Tensor
 from hvnet.kernels.launch import array, check_index, check_tensor, launch
 from hvnet.kernels.scatter import Segments, segments
 
-KEY_BITS = 62  # of a sort key in int64
-AXIS_BITS = 16  # of a key for either axis: 6.5 km of 0.1 m cells
+KEY_BITS = 31  # of a sort key: it shares an int64 with the number of its point
 DIGIT_BITS = wp.constant(11)  # of a pass of the radix sort
 DIGITS = wp.constant(1 << 11)
 OUTSIDE = wp.constant(1 << 62)  # the key of a point outside, after all others
@@ -105,7 +104,7 @@ def voxel_index(points: Tensor, sample: Tensor, batch_size: int, grids: Sequence
 
     A point is kept iff it is inside every grid. Where each cell is a power of two times the finest, one sort by the
     Morton key of the finest grid makes every voxel of every scale a run of consecutive points; other scales, and grids
-    too large for a key (more than 65,536 cells a side), go through the hash table.
+    too large for a key (more than 2^31 cells in all samples), go through the hash table.
     """
     _check_points(points, sample)
     if not grids:
@@ -163,26 +162,35 @@ def _grids(flat: Sequence[float]) -> list[Grid]:
 def is_nested(grids: Sequence[Grid], batch_size: int) -> bool:
     """Whether one sort serves all grids: each cell a power of two times the finest, to the bit, and keys that fit."""
     finest = min(grids, key=lambda grid: grid.cell)
-    fits = _bits(finest) <= AXIS_BITS and 2 * _bits(finest) + batch_size.bit_length() <= KEY_BITS
+    fits = 2 * _bits(finest) + (batch_size - 1).bit_length() <= KEY_BITS
     return fits and all(_level(grid, finest) is not None for grid in grids)
 
 
 def nested_index(points: Tensor, sample: Tensor, grids: Sequence[Grid]) -> NestedIndex:
     """The voxels of points (N, 4) float32 of samples (N,) int64 in grids that nest; nothing is read from the device."""
-    finest = min(grids, key=lambda grid: grid.cell)
-    levels = [_level(grid, finest) or 0 for grid in grids]
-    bits, device = 2 * _bits(finest), points.device
-    # inside every grid: the finest index, cut to a coarser grid's cells, is compared with each
-    cells = wp.vec2i(*(min(g.cells[axis] << level for g, level in zip(grids, levels, strict=True)) for axis in (0, 1)))
-    height = wp.vec2(max(grid.z_min for grid in grids), min(grid.z_max for grid in grids))
-    low, reciprocal = wp.vec2(finest.x_min, finest.y_min), wp.vec2(1.0 / finest.cell[0], 1.0 / finest.cell[1])
-    inputs = [array(points.contiguous(), 4), array(sample.contiguous()), low, height, reciprocal, cells, wp.int64(bits)]
-    of_scales = _scales(tuple(grids), tuple(levels), device)
+    device = points.device
+    of_grid, of_scales, bits = _nesting(tuple(grids), device)
+    inputs = [array(points.contiguous(), 4), array(sample.contiguous()), *of_grid]
     if device.type == "cpu":
         return _serial_index(inputs, len(points), of_scales)
     keys = torch.empty(len(points), dtype=torch.int64, device=device)
     launch(_key_kernel, len(points), [*inputs, array(keys)], device)
     return _parallel_index(keys, of_scales, bits)
+
+
+@functools.cache
+def _nesting(grids: tuple[Grid, ...], device: torch.device) -> tuple[list[object], Tensor, int]:
+    """What the kernels want of grids that nest: the finest grid, then of every scale (S, 3) the bits of a Morton key to
+    drop, N_L and N_W, and the bits of a key. Kept, so that a frame copies nothing to a GPU."""
+    finest = min(grids, key=lambda grid: grid.cell)
+    levels = [_level(grid, finest) or 0 for grid in grids]
+    # inside every grid: the finest index, cut to a coarser grid's cells, is compared with each
+    cells = wp.vec2i(*(min(g.cells[axis] << level for g, level in zip(grids, levels, strict=True)) for axis in (0, 1)))
+    height = wp.vec2(max(grid.z_min for grid in grids), min(grid.z_max for grid in grids))
+    low, reciprocal = wp.vec2(finest.x_min, finest.y_min), wp.vec2(1.0 / finest.cell[0], 1.0 / finest.cell[1])
+    bits = 2 * _bits(finest)
+    rows = [(2 * level, *grid.shape) for grid, level in zip(grids, levels, strict=True)]
+    return [low, height, reciprocal, cells, wp.int64(bits)], torch.tensor(rows, device=device), bits
 
 
 def _parallel_index(keys: Tensor, of_scales: Tensor, bits: int) -> NestedIndex:
@@ -203,20 +211,13 @@ def _parallel_index(keys: Tensor, of_scales: Tensor, bits: int) -> NestedIndex:
 def _serial_index(inputs: list[object], count: int, of_scales: Tensor) -> NestedIndex:
     """The same for one thread: a radix sort of the points inside, then one walk over them for all scales."""
     scales = len(of_scales)
-    order, work = torch.empty(count, dtype=torch.int64), torch.empty(4, count, dtype=torch.int64)
+    order, work = torch.empty(count, dtype=torch.int64), torch.empty(2, count, dtype=torch.int64)
     voxel, cursor = (torch.empty(scales, count, dtype=torch.int64) for _ in range(2))
     starts, counts = torch.empty(scales, count + 1, dtype=torch.int64), torch.zeros(scales + 1, dtype=torch.int64)
     digits = torch.zeros(DIGITS, dtype=torch.int64)
     outputs = [array(tensor) for tensor in (of_scales, work, digits, order, voxel, starts, cursor, counts)]
     launch(_serial_kernel, 1, [*inputs, *outputs], order.device)
     return NestedIndex(order, voxel, starts, cursor, counts)
-
-
-@functools.cache
-def _scales(grids: tuple[Grid, ...], levels: tuple[int, ...], device: torch.device) -> Tensor:
-    """Of every scale (S, 3): bits of a Morton key to drop, N_L, N_W. Kept, so that a frame copies nothing to a GPU."""
-    rows = [(2 * level, *grid.shape) for grid, level in zip(grids, levels, strict=True)]
-    return torch.tensor(rows, dtype=torch.int64, device=device)
 
 
 def _bits(grid: Grid) -> int:
@@ -402,17 +403,15 @@ def _serial_kernel(
     cursor: wp.array2d(dtype=wp.int64),
     counts: wp.array(dtype=wp.int64),
 ):
-    # keys in rows 0 and 1 of the work, points in rows 2 and 3: a pass goes from one side to the other. The loops write
-    # whether or not a point counts and move on only if it does: a branch that chance decides costs more than a write
-    # (and `while` compiles to a plainer loop than `range`)
+    # a word is a key and below it, in 32 bits, the number of its point; a pass goes from one row of the work to the
+    # other (`while`, because it compiles to a plainer loop than `range`)
     kept = int(0)
     largest = wp.int64(0)
     i = int(0)
     while i < points.shape[0]:
         key = _key(points, sample, i, low, height, reciprocal, cells, bits)
-        work[0, kept] = key
-        work[2, kept] = wp.int64(i)
         if key != wp.int64(OUTSIDE):
+            work[0, kept] = (key << wp.int64(32)) | wp.int64(i)
             kept += 1
             largest = wp.max(largest, key)
             d = int(key & wp.int64(DIGITS - 1))
@@ -428,12 +427,11 @@ def _serial_kernel(
             total += own
         i = int(0)
         while i < kept:
-            key = work[side, i]
-            d = int((key >> shift) & wp.int64(DIGITS - 1))
+            word = work[side, i]
+            d = int((word >> (shift + wp.int64(32))) & wp.int64(DIGITS - 1))
             at = int(digits[d])
             digits[d] = wp.int64(at + 1)
-            work[1 - side, at] = key
-            work[3 - side, at] = work[2 + side, i]
+            work[1 - side, at] = word
             i += 1
         side = 1 - side
         shift += wp.int64(DIGIT_BITS)
@@ -442,22 +440,23 @@ def _serial_kernel(
                 digits[d] = wp.int64(0)
             i = int(0)
             while i < kept:
-                d = int((work[side, i] >> shift) & wp.int64(DIGITS - 1))
+                d = int((work[side, i] >> (shift + wp.int64(32))) & wp.int64(DIGITS - 1))
                 digits[d] = digits[d] + wp.int64(1)
                 i += 1
     i = int(0)
     while i < kept:
-        order[i] = work[2 + side, i]
+        order[i] = work[side, i] & wp.int64(0xFFFFFFFF)
         i += 1
     counts[scales.shape[0]] = wp.int64(kept)
     for s in range(scales.shape[0]):
+        # whether or not a voxel begins, its key and its end are written: a branch that chance decides costs more
         drop = scales[s, 0]
         v = int(-1)
         before = wp.int64(-1)
         starts[s, 0] = wp.int64(0)
         i = int(0)
         while i < kept:
-            key = work[side, i] >> drop
+            key = work[side, i] >> (drop + wp.int64(32))
             v += wp.where(key == before, 0, 1)
             before = key
             voxel[s, i] = wp.int64(v)

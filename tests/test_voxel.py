@@ -461,8 +461,8 @@ def test_one_thread_and_many_give_the_same_index(scales: list[float], count: int
     for grid in grids:  # a coarser grid may reach further than the finest, none less far
         assert (voxel.cursors(points, sample, grid) >= 0)[cursor >= 0].all()
     keys[cursor < 0] = 1 << 62
-    of_scales = voxel._scales(tuple(grids), tuple(voxel._level(grid, finest) for grid in grids), device)
-    parallel = voxel._parallel_index(keys.to(device), of_scales, 2 * bits)
+    _, of_scales, key_bits = voxel._nesting(tuple(grids), device)
+    parallel = voxel._parallel_index(keys.to(device), of_scales, key_bits)
     serial = voxel.nested_index(points, sample, grids)
     assert torch.equal(serial.counts, parallel.counts.cpu())
     *voxels, kept = serial.counts.tolist()
