@@ -86,6 +86,8 @@ class AugmentConfig:
     scaling: tuple[float, float] = (0.95, 1.05)
     translation: tuple[float, float, float] = (0.2, 0.2, 0.2)  # standard deviations in metres
     objects: dict[str, int] = field(default_factory=dict)  # objects of a class after ground-truth sampling
+    whole_frames: float = 0.0  # probability that all objects of one frame of the database are inserted instead
+    mix: float = 0.0  # probability that a sector of the frame is taken from another frame
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,8 @@ class TrainConfig:
     warmup_ratio: float = 1 / 3
     decay_epochs: tuple[int, ...] = (40, 60)
     decay_ratio: float = 0.1
+    cosine: bool = False  # after the warm-up half a cosine down to zero, instead of the steps at decay_epochs
+    repeat: int = 1  # times that an epoch goes through the frames, each time augmented anew
     gradient_clip: float = 10.0  # largest norm of the gradient
     validate_every: int = 10  # epochs; the last epoch is always validated
     pictures: int = 4  # validation frames drawn
@@ -303,10 +307,12 @@ def _check(config: Config, source: str) -> None:
     want(augment.rotation >= 0, "augment.rotation", "0 or more", augment.rotation)
     want(0 < augment.scaling[0] <= augment.scaling[1], "augment.scaling", "0 < low <= high", list(augment.scaling))
     want(min(augment.translation) >= 0, "augment.translation", "0 or more", list(augment.translation))
+    for key in ("whole_frames", "mix"):
+        want(0 <= getattr(augment, key) <= 1, f"augment.{key}", "between 0 and 1", getattr(augment, key))
     for name, count in augment.objects.items():
         want(name in names, f"augment.objects.{name}", f"a class of head.classes ({', '.join(names)})", name)
         want(count >= 0, f"augment.objects.{name}", "0 or more", count)
-    for key in ("epochs", "batch_size", "validate_every"):
+    for key in ("epochs", "repeat", "batch_size", "validate_every"):
         want(getattr(train, key) > 0, f"train.{key}", "1 or more", getattr(train, key))
     for key in ("warmup_steps", "pictures", "workers", "weight_decay", "seed"):
         want(getattr(train, key) >= 0, f"train.{key}", "0 or more", getattr(train, key))

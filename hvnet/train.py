@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from hvnet.cli import InputError, run_command
 from hvnet.config import Config, TrainConfig, config_to_dict, load_config
-from hvnet.data.augment import augment
+from hvnet.data.augment import augment, mix_sectors
 from hvnet.data.database import FILE_NAME, Database, build_database, read_database, write_database
 from hvnet.data.kitti import (
     Frame,
@@ -67,17 +67,24 @@ class TrainingFrames(Dataset[Sample]):
 
     def __getitem__(self, item: tuple[int, int]) -> Sample:
         epoch, k = item
+        options = self.config.augment
+        generator = seeded(self.config.train.seed, epoch, k)
+        points, boxes, labels, note = self.read(k % len(self.ids))
+        if options.mix and torch.rand((), generator=generator).item() < options.mix:
+            other = int(torch.randint(len(self.ids), (), generator=generator))
+            points, boxes, labels = mix_sectors(points, boxes, labels, self.read(other)[:3], generator)
+        points, boxes, labels = augment(points, boxes, labels, self.database, options, generator, self.classes)
+        low, high = boxes.new_tensor(self.config.encoder.point_range).view(2, 3)
+        inside = ((boxes[:, :2] >= low[:2]) & (boxes[:, :2] < high[:2])).all(dim=1) & (labels >= 0)
+        return points, boxes[inside], labels[inside], note
+
+    def read(self, k: int) -> Sample:
+        """Frame k as it is; boxes of classes that are not trained have label -1."""
         frame = self.kept.get(k) or read_frame(self.root, self.ids[k])
         if self.config.train.workers == 0:  # read once; several workers would each keep all frames
             self.kept[k] = frame
         labels = torch.tensor([self.classes.index(n) if n in self.classes else -1 for n in frame.names]).long()
-        generator = seeded(self.config.train.seed, epoch, k)
-        points, boxes, labels = augment(
-            frame.points, frame.boxes, labels, self.database, self.config.augment, generator, self.classes
-        )
-        low, high = boxes.new_tensor(self.config.encoder.point_range).view(2, 3)
-        inside = ((boxes[:, :2] >= low[:2]) & (boxes[:, :2] < high[:2])).all(dim=1) & (labels >= 0)
-        return points, boxes[inside], labels[inside], frame.note
+        return frame.points, frame.boxes, labels, frame.note
 
 
 class EpochOrder(Sampler[tuple[int, int]]):
@@ -117,9 +124,16 @@ def collate(samples: Sequence[Sample]) -> Batch:
     return Batch(torch.cat(points), sample, list(boxes), list(labels), list(notes))
 
 
-def learning_rate(config: TrainConfig, step: int, epoch: int) -> float:
-    """Linear warm-up from warmup_ratio times the rate, then a decay at each of decay_epochs (Sec. 4.1)."""
-    decayed = config.learning_rate * config.decay_ratio ** sum(epoch >= at for at in config.decay_epochs)
+def learning_rate(config: TrainConfig, step: int, epoch: int, steps: int) -> float:
+    """Linear warm-up from warmup_ratio times the rate, then a decay at each of decay_epochs (Sec. 4.1) or a cosine.
+
+    `steps` is the length of the run.
+    """
+    if config.cosine:
+        done = (step - config.warmup_steps) / max(1, steps - config.warmup_steps)
+        decayed = config.learning_rate * (1 + math.cos(math.pi * min(max(done, 0.0), 1.0))) / 2
+    else:
+        decayed = config.learning_rate * config.decay_ratio ** sum(epoch >= at for at in config.decay_epochs)
     if step < config.warmup_steps:
         return decayed * (config.warmup_ratio + (1 - config.warmup_ratio) * step / config.warmup_steps)
     return decayed
@@ -146,7 +160,7 @@ def train_epoch(
     bar = tqdm(read_batches(loader), total=len(loader), desc=title, unit="batch", leave=False, dynamic_ncols=True)
     for batch in bar:
         for group in optimizer.param_groups:
-            group["lr"] = learning_rate(config, step, epoch)
+            group["lr"] = learning_rate(config, step, epoch, config.epochs * len(loader))
         say_once(batch.notes, said)
         batch = batch.to(device)
         terms = model.loss(model(batch.points, batch.sample, len(batch.boxes)), batch.boxes, batch.labels)
@@ -195,13 +209,13 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
     for name in tqdm([*train_ids, *val_ids], desc="checking", unit="frame", leave=False, dynamic_ncols=True):
         check_frame(root, name)
     database = load_database(root, config, val_ids) if config.augment.objects else None
-    order = EpochOrder(len(train_ids), config.train.seed)
+    order = EpochOrder(config.train.repeat * len(train_ids), config.train.seed)
     loader: DataLoader = DataLoader(
         TrainingFrames(root, train_ids, config, database),
         batch_size=config.train.batch_size,
         sampler=order,
         collate_fn=collate,
-        drop_last=len(train_ids) >= config.train.batch_size,
+        drop_last=len(order) >= config.train.batch_size,
         num_workers=config.train.workers,
         persistent_workers=config.train.workers > 0,
         # a forked worker would inherit Warp, CUDA and the threads of this process

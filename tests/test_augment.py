@@ -13,10 +13,12 @@ from hvnet.boxes import bev_corners, boxes_collide, points_in_boxes
 from hvnet.config import AugmentConfig
 from hvnet.data.augment import (
     augment,
+    mix_sectors,
     random_flip,
     random_rotation,
     random_scaling,
     random_translation,
+    sample_frame,
     sample_objects,
 )
 from hvnet.data.database import Database, object_points, read_database
@@ -244,6 +246,53 @@ def test_no_objects_asked_for() -> None:
     database = make_database([("Car", car(100, 0))])
     sampled = sample_objects(points, boxes, labels, database, {}, seeded(), CLASSES)
     assert all(a is b for a, b in zip(sampled, (points, boxes, labels), strict=True))
+
+
+def test_a_whole_frame_keeps_together() -> None:
+    objects = [("Car", car(10.0 * k, 0)) for k in range(4)] + [("Van", car(50, 0)), ("Pedestrian", car(60, 0))]
+    database = make_database(objects)
+    database.frame[:] = [3, 7, 7, 3, 7, 7]
+    found = set()
+    for seed in range(10):
+        points, boxes, labels = sample_frame(torch.zeros(0, 4), *no_boxes(), database, seeded(seed), CLASSES)
+        assert len(points) == 10 * len(boxes)
+        found.add((tuple(boxes[:, 0].tolist()), tuple(labels.tolist())))
+    assert found == {((0.0, 30.0), (0, 0)), ((10.0, 20.0, 50.0, 60.0), (0, 0, -1, 1))}
+
+
+def test_mixed_sectors_meet_at_a_border() -> None:
+    """Two rings of points: each side is of one frame, no point is there twice, and every box has all its points."""
+    angle = torch.linspace(-1.5, 1.5, 600)
+    ring = torch.stack((20 * angle.cos(), 20 * angle.sin(), torch.zeros(600), torch.zeros(600)), dim=1)
+    other_ring = ring + torch.tensor([0, 0, 0, 1.0])
+    around = [[20 * math.cos(a), 20 * math.sin(a), 0.0, 4.0, 2.0, 2.0, a + math.pi / 2] for a in (-0.6, 0.0, 0.6)]
+    boxes, labels = torch.tensor(around), torch.tensor([0, 1, -1])
+    outcomes = set()
+    for seed in range(20):
+        others = (other_ring, boxes.clone(), labels + 20)
+        points, kept, of_kept = mix_sectors(ring, boxes, labels, others, seeded(seed))
+        own = of_kept < 10
+        assert len(kept) == 3  # the two frames have boxes at the same three places
+        outcomes.add(tuple(sorted(of_kept.tolist())))
+        for box, is_own in zip(kept, own, strict=True):
+            inside = points[points_in_boxes(points, box[None])[:, 0]]
+            assert (inside[:, 3] == (0.0 if is_own else 1.0)).all()
+            assert len(inside) == int(points_in_boxes(ring, box[None]).sum())
+        order = torch.atan2(points[:, 1], points[:, 0]).argsort()
+        assert (points[order, 3].diff() != 0).sum() <= 3
+        assert len(points[:, :3].unique(dim=0)) == len(points)
+    assert len(outcomes) > 2
+
+
+def test_mixing_with_an_empty_frame_leaves_a_side() -> None:
+    points, boxes = scene()
+    labels = torch.zeros(len(boxes), dtype=torch.int64)
+    nothing = (torch.zeros(0, 4), *no_boxes())
+    left, left_boxes, _ = mix_sectors(points, boxes, labels, nothing, seeded(1))
+    assert 0 < len(left) < len(points)
+    assert 0 < len(left_boxes) < len(boxes)
+    inside = points_in_boxes(points, left_boxes).any(1)
+    assert points_in_boxes(left, left_boxes).any(1).sum() == inside.sum()
 
 
 def test_real_frame_with_the_real_database(kitti_root: Path) -> None:

@@ -439,8 +439,11 @@ def test_learning_rate() -> None:
     table = [(0, 0, 1.0), (5, 0, 2.0), (9, 0, 2.8), (10, 0, 3.0), (99, 3, 3.0), (100, 4, 0.3), (150, 5, 0.3),
              (200, 6, 0.03), (999, 60, 0.03)]  # fmt: skip
     for step, epoch, rate in table:
-        assert learning_rate(config, step, epoch) == pytest.approx(rate), (step, epoch)
-    assert learning_rate(dataclasses.replace(config, warmup_steps=0), 0, 0) == 3.0
+        assert learning_rate(config, step, epoch, 1000) == pytest.approx(rate), (step, epoch)
+    assert learning_rate(dataclasses.replace(config, warmup_steps=0), 0, 0, 1000) == 3.0
+    cosine = dataclasses.replace(config, cosine=True)
+    for step, rate in [(0, 1.0), (5, 2.0 * (1 + math.cos(0)) / 2), (10, 3.0), (60, 1.5), (110, 0.0), (111, 0.0)]:
+        assert learning_rate(cosine, step, 9, 110) == pytest.approx(rate, abs=1e-12), step
 
 
 def test_an_item_depends_on_seed_epoch_and_number_alone(scenes: Path, tiny: Config) -> None:

@@ -34,7 +34,10 @@ def augment(
     keep the pose in which the scanner saw them, which is in the camera's view only before the frame is turned.
     """
     if database is not None:
-        points, boxes, labels = sample_objects(points, boxes, labels, database, options.objects, generator, classes)
+        if options.whole_frames and torch.rand((), generator=generator).item() < options.whole_frames:
+            points, boxes, labels = sample_frame(points, boxes, labels, database, generator, classes)
+        else:
+            points, boxes, labels = sample_objects(points, boxes, labels, database, options.objects, generator, classes)
     points, boxes = random_flip(points, boxes, options.flip, generator)
     points, boxes = random_rotation(points, boxes, options.rotation, generator)
     points, boxes = random_scaling(points, boxes, options.scaling, generator)
@@ -88,6 +91,35 @@ def random_translation(
     return points, boxes
 
 
+def mix_sectors(
+    points: Tensor, boxes: Tensor, labels: Tensor, others: tuple[Tensor, Tensor, Tensor], generator: Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """All to one side of a direction is taken from another frame (points, boxes, labels), as PolarMix (Xiao et al.,
+    2022) swaps sectors of scans.
+
+    The direction is uniform within 30 degrees of straight ahead. A box belongs to the side of its centre and keeps its
+    points beyond the border; there the points of the frame on that side give way.
+    """
+    border = _uniform(-math.pi / 6, math.pi / 6, generator)
+    left_from_other = torch.rand((), generator=generator).item() < 0.5
+
+    def left(rows: Tensor) -> Tensor:
+        return torch.atan2(rows[:, 1], rows[:, 0]) > border
+
+    kept_boxes, other_boxes = left(boxes) != left_from_other, left(others[1]) == left_from_other
+    own, own_labels = boxes[kept_boxes], labels[kept_boxes]
+    new, new_labels = others[1][other_boxes], others[2][other_boxes]
+    in_own, in_new = points_in_boxes(points, own).any(dim=1), points_in_boxes(points, new).any(dim=1)
+    from_own, from_new = points_in_boxes(others[0], own).any(dim=1), points_in_boxes(others[0], new).any(dim=1)
+    stays = (in_own | (left(points) != left_from_other)) & ~(in_new & ~in_own)
+    comes = (from_new | (left(others[0]) == left_from_other)) & ~(from_own & ~from_new)
+    # an object cut away on the other side must not stay behind as half of one
+    cut, cut_other = points_in_boxes(points, boxes[~kept_boxes]), points_in_boxes(others[0], others[1][~other_boxes])
+    stays &= ~cut.any(dim=1) | in_own
+    comes &= ~cut_other.any(dim=1) | from_new
+    return torch.cat((points[stays], others[0][comes])), torch.cat((own, new)), torch.cat((own_labels, new_labels))
+
+
 def sample_objects(
     points: Tensor,
     boxes: Tensor,
@@ -100,21 +132,41 @@ def sample_objects(
     """Ground-truth sampling of SECOND: inserts objects of other frames, where they stood in these.
 
     labels (M,) int64 number the boxes' classes in `classes`; boxes of any other number only block their place. Of each
-    class in `counts` so many objects are drawn, without replacement, that the frame has this count of them; one that
-    collides in bird's eye view with a box of the frame or with one inserted before is given up, not redrawn. Points of
-    the frame inside an inserted box give way to the object's own.
+    class in `counts` so many objects are drawn, without replacement, that the frame has this count of them.
     """
-    candidates = []
-    chosen_labels: list[int] = []
+    drawn: list[np.ndarray] = [np.empty(0, np.int64)]
+    drawn_labels: list[int] = []
     usable = _usable(database)
     for name, count in counts.items():
         label = classes.index(name)
         missing = max(0, count - int((labels == label).sum()))
         objects = np.flatnonzero(usable & (database.name == name))
         picked = torch.randperm(len(objects), generator=generator)[:missing].numpy()
-        candidates.append(objects[picked])
-        chosen_labels += [label] * len(picked)
-    drawn = np.concatenate(candidates) if candidates else np.empty(0, np.int64)
+        drawn.append(objects[picked])
+        drawn_labels += [label] * len(picked)
+    return _insert(points, boxes, labels, database, np.concatenate(drawn), drawn_labels)
+
+
+def sample_frame(
+    points: Tensor, boxes: Tensor, labels: Tensor, database: Database, generator: Generator, classes: Sequence[str]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Inserts all objects of one frame of the database, so that they stand together as they did: a queue at a light,
+    cars along a kerb. Those of other classes come with them and have label -1."""
+    frames = np.unique(database.frame)
+    frame = frames[int(torch.randint(len(frames), (), generator=generator))]
+    drawn = np.flatnonzero((database.frame == frame) & (np.diff(database.offsets) >= MIN_POINTS))
+    drawn_labels = [classes.index(name) if name in classes else -1 for name in database.name[drawn]]
+    return _insert(points, boxes, labels, database, drawn, drawn_labels)
+
+
+def _insert(
+    points: Tensor, boxes: Tensor, labels: Tensor, database: Database, drawn: np.ndarray, drawn_labels: Sequence[int]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Inserts rows of the database, in this order, into a frame.
+
+    An object that collides in bird's eye view with a box of the frame or with one inserted before is given up, not
+    redrawn. Points of the frame inside an inserted box give way to the object's own.
+    """
     drawn_boxes = torch.from_numpy(database.box[drawn])
     collides = boxes_collide(drawn_boxes, torch.cat((boxes, drawn_boxes))).numpy()
     standing = np.arange(len(boxes) + len(drawn)) < len(boxes)
@@ -126,7 +178,7 @@ def sample_objects(
     new_boxes = drawn_boxes[inserted]
     points = points[~points_in_boxes(points, new_boxes).any(dim=1)]
     points = torch.cat([points, *(object_points(database, k) for k in drawn[inserted])])
-    return points, torch.cat((boxes, new_boxes)), torch.cat((labels, labels.new_tensor(chosen_labels)[inserted]))
+    return points, torch.cat((boxes, new_boxes)), torch.cat((labels, labels.new_tensor(drawn_labels)[inserted]))
 
 
 def _usable(database: Database) -> np.ndarray:
