@@ -31,9 +31,10 @@ from hvnet.data.kitti import (
     read_split,
     write_labels,
 )
+from hvnet.detector import Detector, load
 from hvnet.draw import draw_bev
 from hvnet.evaluate import CLASSES, evaluate, format_table
-from hvnet.model import Detections, Detector, load
+from hvnet.model import Detections
 
 TEST_FRAMES = 7518
 """Frames 000000 to 007517 are KITTI's test set; its server rejects results with fewer."""
@@ -216,7 +217,7 @@ def detect(detector: Detector, sources: Sequence[Source], out: Path, pictures: i
         cloud = read_source(source, detector.classes)
         for note in cloud.notes:
             tqdm.write(note)
-        found = Detections(*(part.cpu() for part in detector(cloud.points)))
+        found = detector(cloud.points)
         (out / "results").mkdir(parents=True, exist_ok=True)  # not before the first cloud is read
         rows, result_file = result_rows(found, cloud, detector.classes), out / "results" / f"{source.name}.txt"
         write_labels(result_file, submission_rows(rows) if submit else rows)
@@ -228,21 +229,13 @@ def detect(detector: Detector, sources: Sequence[Source], out: Path, pictures: i
                 table.writerow(["cloud", "class", "score", "x", "y", "z", "length", "width", "height", "yaw"])
             table.writerows(csv_rows(source.name, found, detector.classes))
         if k < pictures:
-            point_range = detector.model.config.encoder.point_range
+            point_range = detector.config.encoder.point_range
             path = out / "pictures" / f"{source.name}.png"
             draw_bev(path, cloud.points, point_range, cloud.truth, *found, detector.classes, source.name)
         total += len(found.boxes)
     if submit:
         write_submission(out / "submission.zip", out / "results")
     return total
-
-
-def latest_checkpoint(runs: Path) -> Path:
-    """The checkpoint that was written last by a run below a folder. Raises InputError if there is none."""
-    found = sorted(runs.glob("*/checkpoint.pt"), key=lambda path: path.stat().st_mtime_ns)
-    if not found:
-        raise InputError(f"{runs}: holds no run; give --checkpoint FILE, or train with python -m hvnet.train")
-    return found[-1]
 
 
 def main(arguments: Sequence[str] | None) -> None:
@@ -262,7 +255,7 @@ def main(arguments: Sequence[str] | None) -> None:
         "inputs", nargs="+", type=Path, metavar="INPUT", help=f"files ({', '.join(SUFFIXES)}), folders, KITTI roots"
     )
     parser.add_argument(
-        "--checkpoint", type=Path, metavar="FILE", help="of python -m hvnet.train (default: the latest below runs/)"
+        "--checkpoint", type=Path, metavar="FILE", help="of python -m hvnet.train (default: the weights of the package)"
     )
     parser.add_argument("--split", help="frames of ImageSets/SPLIT.txt of a KITTI root (default: all frames)")
     parser.add_argument(
@@ -285,7 +278,7 @@ def main(arguments: Sequence[str] | None) -> None:
         if blind:
             width, height = IMAGE_SIZE
             print(f"{blind} frames have no file in image_2; their 2D boxes are clipped to {width} x {height}")
-    detector = load(options.checkpoint or latest_checkpoint(Path("runs")), options.device)
+    detector = load(options.checkpoint, options.device)
     total = detect(detector, sources, options.out, options.pictures, submit)
     if scores := score_results(sources, options.out / "results", detector.classes):
         print(scores + "\n")

@@ -220,7 +220,7 @@ class FusedEncoder:
         """As HybridVoxelEncoder in evaluation mode; the images are of the dtype, float32, float16 or bfloat16."""
         encoder, avfe, avfeo = self.encoder, self.encoder.avfe, self.encoder.avfeo
         grids = list(dict.fromkeys(encoder.feature_grids + encoder.projection_grids))
-        if not is_nested(grids, batch_size):
+        if not self.is_nested(batch_size):
             training = encoder.training
             images = encoder.eval()(points, sample, batch_size)
             encoder.train(training)
@@ -256,6 +256,10 @@ class FusedEncoder:
             images.append(image.view(batch_size, *grid.shape, -1).permute(0, 3, 1, 2))
         return images
 
+    def is_nested(self, batch_size: int) -> bool:
+        """Whether one sort serves all scales, so that nothing is read from the device."""
+        return is_nested(self.encoder.feature_grids + self.encoder.projection_grids, batch_size)
+
     def image(
         self, grid: Grid, scale: Scale, batch_size: int, channels: int, dtype: torch.dtype, device: torch.device
     ) -> Tensor:
@@ -263,7 +267,10 @@ class FusedEncoder:
         key = (grid, batch_size, dtype, device)
         if key in self.written:
             image, last = self.written[key]
-            clear_voxels(image, last)
+            if device.type == "cuda":
+                image.zero_()  # a graph replays what was captured: it would not know the cells written last
+            else:
+                clear_voxels(image, last)
         else:
             image = torch.zeros(batch_size * grid.shape[0] * grid.shape[1], channels, dtype=dtype, device=device)
         self.written[key] = image, scale

@@ -5,14 +5,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hvnet.anchors import assign_targets, decode, make_anchors
 from hvnet.backbone import Backbone
 from hvnet.cli import InputError
 from hvnet.config import Config, config_from_dict
-from hvnet.encoder import FusedEncoder, HybridVoxelEncoder
+from hvnet.encoder import HybridVoxelEncoder
 from hvnet.head import Head, HeadMaps
 from hvnet.kernels.rotated import rotated_nms
 from hvnet.loss import class_loss
@@ -33,7 +32,6 @@ class HVNet(nn.Module):
         super().__init__()
         self.config = config
         self.encoder = HybridVoxelEncoder(config.encoder)
-        self.fused = FusedEncoder(self.encoder)
         self.backbone = Backbone(config.backbone, config.encoder.image_channels, len(config.encoder.projection_scales))
         channels = config.backbone.fusion_channels
         self.heads = nn.ModuleList(Head(entry, channels, config.head.direction) for entry in config.head.classes)
@@ -51,7 +49,8 @@ class HVNet(nn.Module):
 
     def maps_of(self, images: list[Tensor]) -> list[HeadMaps]:
         """Pseudo-images, finest first, to the maps of every class."""
-        with torch.autocast(images[0].device.type, torch.bfloat16, enabled=self.config.train.bfloat16):
+        bfloat16 = self.config.train.bfloat16 and self.training
+        with torch.autocast(images[0].device.type, torch.bfloat16, enabled=bfloat16):
             levels = self.backbone(images)
             return [head(levels[entry.level]) for head, entry in zip(self.heads, self.config.head.classes, strict=True)]
 
@@ -67,10 +66,13 @@ class HVNet(nn.Module):
 
     @torch.no_grad()
     def detect(self, points: Tensor, sample: Tensor, batch_size: int) -> list[Detections]:
-        """Boxes of every sample, in evaluation mode: scores above the threshold, then rotated NMS class by class."""
+        """Boxes of every sample, in evaluation mode: scores above the threshold, then rotated NMS class by class.
+
+        This is the plain way, in float32; `hvnet.detector` has the fast one.
+        """
         if self.training:
             raise RuntimeError("detect: the model is in training mode; call eval() first")
-        maps = self.maps_of(self.fused(points, sample, batch_size))
+        maps = self(points, sample, batch_size)
         samples = []
         for b in range(batch_size):
             parts = [self._detect_class(label, of_class.of_sample(b)) for label, of_class in enumerate(maps)]
@@ -131,29 +133,3 @@ def select_device(name: str) -> torch.device:
         return torch.device(name)
     except RuntimeError as error:
         raise InputError(f"--device {name}: want auto, cpu, cuda or cuda:N") from error
-
-
-class Detector:
-    """A trained model on a device: `detector(points)` gives the boxes of one cloud."""
-
-    def __init__(self, model: HVNet, device: torch.device) -> None:
-        self.model = model.to(device).eval()
-        self.device = device
-        self.classes = tuple(entry.name for entry in model.config.head.classes)
-
-    def __call__(self, points: Tensor | NDArray) -> Detections:
-        """Points (N, 4), x, y, z in metres and reflectance in [0, 1], to boxes (M, 7), scores (M,), labels (M,).
-
-        Points outside the range and points that are not finite take no part. Results lie on the detector's device.
-        """
-        cloud = torch.as_tensor(points, dtype=torch.float32, device=self.device)
-        if cloud.ndim != 2 or cloud.shape[1] != 4:
-            raise ValueError(f"points: want shape (N, 4) with x, y, z, reflectance, got {tuple(cloud.shape)}")
-        sample = torch.zeros(len(cloud), dtype=torch.int64, device=self.device)
-        return self.model.detect(cloud, sample, 1)[0]
-
-
-def load(checkpoint: str | Path, device: str = "auto") -> Detector:
-    """A detector from a checkpoint of `python -m hvnet.train`. Raises InputError naming the file."""
-    model = model_from_checkpoint(load_checkpoint(checkpoint), str(checkpoint))
-    return Detector(model, select_device(device))

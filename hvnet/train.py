@@ -30,6 +30,7 @@ from hvnet.data.kitti import (
     read_split,
 )
 from hvnet.data.synthetic import Options, generate
+from hvnet.detector import Detector
 from hvnet.draw import draw_bev
 from hvnet.evaluate import CLASSES, evaluate, format_table
 from hvnet.model import HVNet, load_checkpoint, save_checkpoint, select_device
@@ -183,14 +184,12 @@ def validate(model: HVNet, root: Path, ids: list[str], pictures: Path, said: set
     """Detects in the frames of a split and scores the boxes as KITTI does; draws the first few into a folder."""
     device = next(model.parameters()).device
     classes = [entry.name for entry in model.config.head.classes]
-    model.eval()
+    detector = Detector(model, device)
     labels, predictions = [], []
     for k, name in enumerate(tqdm(ids, desc="validating", unit="frame", leave=False, dynamic_ncols=True)):
         frame = read_frame(root, name)
         say_once([frame.note], said)
-        points = frame.points.to(device)
-        sample = torch.zeros(len(points), dtype=torch.int64, device=device)
-        found = model.detect(points, sample, 1)[0]
+        found = detector(frame.points)
         names = [classes[label] for label in found.labels.tolist()]
         labels.append(frame.labels)
         predictions.append(detections_to_labels(found.boxes, found.scores, names, frame.calib, frame.image_size))

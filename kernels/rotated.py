@@ -211,6 +211,13 @@ def rotated_nms(boxes: Tensor, scores: Tensor, iou_threshold: float) -> Tensor:
 
     A box is dropped iff its BEV IoU with a kept better box is above the threshold (Sec. 4.1 of the paper).
     """
+    order, keep = nms_order(boxes, scores, iou_threshold)
+    return order[keep]
+
+
+def nms_order(boxes: Tensor, scores: Tensor, iou_threshold: float) -> tuple[Tensor, Tensor]:
+    """`rotated_nms` in arrays of fixed size: the indices (M,) of all boxes, best score first, and which of these are
+    kept (M,) bool. Nothing is read from the device."""
     check_tensor("boxes", boxes, FLOATS, (None, 7))
     check_tensor("scores", scores, FLOATS, (len(boxes),), like=boxes)
     order = torch.sort(scores, descending=True, stable=True).indices
@@ -226,7 +233,7 @@ def rotated_nms(boxes: Tensor, scores: Tensor, iou_threshold: float) -> Tensor:
         inputs = [ranked, dtype(iou_threshold), array(mask)]
         launch(_kernels(dtype).nms_mask, (len(boxes), words), inputs, boxes.device)
         launch(_nms_sweep, 1, [array(mask), array(removed), array(keep)], boxes.device)
-    return order[keep]
+    return order, keep
 
 
 def rotated_match(anchors: Tensor, boxes: Tensor, starts: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import os
 import re
 import shutil
 import subprocess
@@ -31,8 +30,9 @@ from hvnet.data.kitti import (
     read_points,
     write_labels,
 )
-from hvnet.detect import NO_IMAGE, Cloud, check_results, csv_rows, latest_checkpoint, main, result_rows, submission_rows
-from hvnet.model import Detections, HVNet, load, save_checkpoint
+from hvnet.detect import NO_IMAGE, Cloud, check_results, csv_rows, main, result_rows, submission_rows
+from hvnet.detector import load
+from hvnet.model import Detections, HVNet, load_checkpoint, save_checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = [
@@ -181,11 +181,11 @@ def test_odd_clouds(checkpoint: Path, tmp_path: Path, points: NDArray) -> None:
 
 
 def test_no_detections(checkpoint: Path, cloud: NDArray[np.float32], tmp_path: Path) -> None:
-    detector = load(checkpoint, "cpu")
-    config = detector.model.config
+    content = load_checkpoint(checkpoint)
+    config = load(checkpoint, "cpu").config
     config = dataclasses.replace(config, head=dataclasses.replace(config.head, score_threshold=0.99))
     path = tmp_path / "checkpoint.pt"
-    save_checkpoint(path, {"config": config_to_dict(config), "model": detector.model.state_dict()})
+    save_checkpoint(path, {"config": config_to_dict(config), "model": content["model"]})
     np.save(tmp_path / "cloud.npy", cloud)
     detect(path, tmp_path / "out", tmp_path / "cloud.npy")
     assert table(tmp_path / "out") == []
@@ -465,14 +465,3 @@ def test_the_command(checkpoint: Path, tmp_path: Path) -> None:
     assert failed.returncode == 2
     assert failed.stdout == ""
     assert failed.stderr == f"error: {missing}: no such file or folder\n"
-
-
-def test_the_latest_checkpoint_is_taken(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="holds no run; give --checkpoint FILE, or train"):
-        latest_checkpoint(tmp_path)
-    for k, name in enumerate(("b", "c", "a")):
-        path = tmp_path / name / "checkpoint.pt"
-        path.parent.mkdir()
-        path.touch()
-        os.utime(path, (k, k))
-    assert latest_checkpoint(tmp_path) == tmp_path / "a" / "checkpoint.pt"

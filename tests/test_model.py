@@ -11,13 +11,11 @@ from torch import Tensor
 
 from hvnet.anchors import assign_targets, decode, encode, make_anchors
 from hvnet.boxes import bev_corners
-from hvnet.cli import InputError
-from hvnet.config import ClassConfig, Config, config_to_dict, load_config
-from hvnet.data.kitti import read_frame
+from hvnet.config import Config, load_config
 from hvnet.head import HeadMaps, anchor_rows
 from hvnet.kernels import reference
 from hvnet.loss import class_loss, focal_loss
-from hvnet.model import Detections, Detector, HVNet, load, save_checkpoint
+from hvnet.model import Detections, HVNet
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 # not square: 32 x 16 cells of 0.4 m at the finest scale
@@ -298,9 +296,10 @@ def test_flipped_scene_gives_flipped_detections(demo: Config, direction: bool) -
             torch.nn.init.zeros_(module.weight[..., 0])
     points = some_points(800)
     model(points, torch.zeros(800, dtype=torch.int64), 1)
-    found = by_score(Detector(model, torch.device("cpu"))(points))
+    sample = torch.zeros(800, dtype=torch.int64)
+    found = by_score(model.eval().detect(points, sample, 1)[0])
     flipped = points * torch.tensor([1.0, -1.0, 1.0, 1.0])
-    other = by_score(Detector(mirror(model), torch.device("cpu"))(flipped))
+    other = by_score(mirror(model).eval().detect(flipped, sample, 1)[0])
     assert len(found.boxes) > 10
     torch.testing.assert_close(found.scores, other.scores, rtol=1e-4, atol=1e-6)
     assert torch.equal(found.labels, other.labels)
@@ -339,61 +338,3 @@ def test_batch_of_samples_is_each_alone(demo: Config) -> None:
             for a, t in zip(alone, together, strict=True):
                 torch.testing.assert_close(a.logits[0], t.logits[b], rtol=1e-4, atol=1e-4)
                 torch.testing.assert_close(a.corners[0], t.corners[b], rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("points", [torch.zeros(0, 4), torch.tensor([[5.0, 0, -1, 0]]), torch.full((3, 4), math.nan)])
-def test_detector_takes_any_cloud(demo: Config, points: Tensor) -> None:
-    found = Detector(HVNet(demo), torch.device("cpu"))(points)
-    assert found.boxes.shape[1:] == (7,)
-    assert len(found.boxes) == len(found.scores) == len(found.labels)
-
-
-def test_detector_refuses_other_shapes(demo: Config) -> None:
-    with pytest.raises(ValueError, match=r"points: want shape \(N, 4\).*got \(5, 3\)"):
-        Detector(HVNet(demo), torch.device("cpu"))(torch.zeros(5, 3))
-
-
-def test_papers_configuration_on_a_real_frame(kitti_root: Path) -> None:
-    torch.manual_seed(0)
-    config = load_config(CONFIGS / "hvnet.yaml")
-    config = dataclasses.replace(config, head=dataclasses.replace(config.head, score_threshold=0.0))
-    frame = read_frame(kitti_root, "000008")
-    found = Detector(HVNet(config), torch.device("cpu"))(frame.points)
-    assert set(found.labels.tolist()) == {0, 1, 2}
-    assert found.boxes.isfinite().all()
-    assert ((found.scores > 0) & (found.scores < 1)).all()
-
-
-def test_checkpoint_gives_the_same_boxes(demo: Config, tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    model = HVNet(demo).eval()
-    path = tmp_path / "checkpoint.pt"
-    save_checkpoint(path, {"config": config_to_dict(demo), "model": model.state_dict()})
-    again = load(path, "cpu")
-    assert again.model.config == demo
-    want = Detector(model, torch.device("cpu"))(some_points())
-    for a, b in zip(again(some_points().numpy()), want, strict=True):
-        assert torch.equal(a, b)
-
-
-def test_bad_checkpoints(demo: Config, tmp_path: Path) -> None:
-    path = tmp_path / "checkpoint.pt"
-    with pytest.raises(InputError, match=r"checkpoint\.pt: no such checkpoint"):
-        load(path)
-    model = HVNet(demo)
-    save_checkpoint(path, {"config": config_to_dict(demo), "model": model.state_dict()})
-    whole = path.read_bytes()
-    for size in (0, 10, len(whole) // 2, len(whole) - 1):
-        path.write_bytes(whole[:size])
-        with pytest.raises(InputError, match=r"checkpoint\.pt: truncated"):
-            load(path)
-    torch.save({"weights": 1}, path)
-    with pytest.raises(InputError, match="holds no config and model"):
-        load(path)
-    wider = config_to_dict(load_config(CONFIGS / "demo.yaml", [*NARROW, "encoder.image_channels=48"]))
-    save_checkpoint(path, {"config": wider, "model": model.state_dict()})
-    with pytest.raises(InputError, match="do not fit its config"):
-        load(path)
-    torch.save({"config": config_to_dict(demo), "model": ClassConfig}, path)
-    with pytest.raises(InputError, match="truncated, or no checkpoint"):
-        load(path)

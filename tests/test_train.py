@@ -21,8 +21,9 @@ from torch.utils.data import DataLoader
 from hvnet.cli import InputError
 from hvnet.config import Config, TrainConfig, load_config
 from hvnet.data.database import build_database, object_points, write_database
+from hvnet.detector import load
 from hvnet.evaluate import CLASSES
-from hvnet.model import load, load_checkpoint, save_checkpoint
+from hvnet.model import load_checkpoint, save_checkpoint
 from hvnet.train import (
     EpochOrder,
     TrainingFrames,

@@ -1,0 +1,140 @@
+"""From a file to boxes, stage by stage: the detector that `hvnet.load` gives, against the plain model, in one run.
+
+Frames are read, encoded, sent through the backbone, scored, decoded and suppressed, warm and synchronised, in turns
+with the plain model: float32, batch norms as they are, every anchor regressed. Before a time is taken, both are checked
+to give the same boxes. `compact` has the shipped weights. `hvnet`, the paper's configuration, has none: its scores mean
+nothing, so its threshold is 0, which sends as many candidates into decoding and NMS as there can be.
+"""
+
+import copy
+import csv
+import dataclasses
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from timing import agree, parser, read_scene, start
+from torch import Tensor
+
+from hvnet.cli import InputError, run_command
+from hvnet.config import load_config
+from hvnet.data.clouds import read_cloud
+from hvnet.detector import SHIPPED, Detector
+from hvnet.model import HVNet, load_checkpoint, model_from_checkpoint
+
+CONFIGS = Path(__file__).resolve().parent.parent / "configs"
+STAGES = ("read", "encode", "backbone", "heads", "decode", "NMS")
+
+
+def make_model(name: str) -> HVNet:
+    """The shipped model, or an untrained one of a config whose batch norms have seen a scene."""
+    if name == "compact":
+        return model_from_checkpoint(load_checkpoint(SHIPPED), str(SHIPPED))
+    torch.manual_seed(0)
+    config = load_config(CONFIGS / f"{name}.yaml")
+    return HVNet(dataclasses.replace(config, head=dataclasses.replace(config.head, score_threshold=0.0))).eval()
+
+
+def check(name: str, model: HVNet, points: Tensor, device: torch.device) -> None:
+    """Ends the benchmark if the detector in float32 and the plain model differ."""
+    sample = torch.zeros(len(points), dtype=torch.int64, device=device)
+    want = copy.deepcopy(model).to(device).detect(points.to(device), sample, 1)[0]
+    found = Detector(model, device, torch.float32)(points)
+    agree(f"{name}, scores", [found.scores], [want.scores], 1e-3, 1e-4)
+    agree(f"{name}, boxes", [found.boxes[:, :6]], [want.boxes[:, :6]], 1e-3, 1e-4)
+
+
+def time_stages(detector: Detector, files: list[Path]) -> dict[str, float]:
+    """Seconds of every stage of one call, and of the whole call as `Detector.batch` does it."""
+    times: dict[str, float] = {}
+
+    def timed(stage: str, run: Callable[[], Any]) -> Any:
+        synchronise(detector.device)
+        begin = time.perf_counter()
+        result = run()
+        synchronise(detector.device)
+        times[stage] = time.perf_counter() - begin
+        return result
+
+    clouds = timed("read", lambda: [torch.from_numpy(read_cloud(file)[0]) for file in files])
+    with torch.no_grad():
+        points, sample = torch.cat(clouds).to(detector.device), samples(clouds).to(detector.device)
+        images = timed("encode", lambda: detector.encode(points, sample, len(files)))
+        levels = timed("backbone", lambda: detector.backbone(images))
+        levels, logits = timed("heads", lambda: detector.score(levels))
+        candidates = timed("decode", lambda: detector.candidates(levels, logits))
+        timed("NMS", lambda: detector.suppress(candidates))
+    timed("detector", lambda: detector.batch(clouds))
+    return times
+
+
+def samples(clouds: Sequence[Tensor]) -> Tensor:
+    """The sample of every point."""
+    return torch.repeat_interleave(torch.arange(len(clouds)), torch.tensor([len(cloud) for cloud in clouds]))
+
+
+def synchronise(device: torch.device) -> None:
+    """Waits for the device."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command."""
+    arguments = parser("detect", __doc__, repeat=20)
+    arguments.add_argument("--points", type=Path, help="a velodyne .bin (default: a generated scene)")
+    arguments.add_argument("--configs", nargs="+", default=["compact", "hvnet"], choices=["compact", "demo", "hvnet"])
+    arguments.add_argument("--batch", nargs="+", type=int, default=[1, 8], help="clouds at once (default: 1 8)")
+    args = arguments.parse_args(argv)
+    if min(args.batch) < 1:
+        raise InputError(f"--batch: want 1 or more, got {min(args.batch)}")
+    bench = start("detect", args)
+    scene = read_scene(args.points)
+    rows: list[dict[str, object]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "cloud.bin"
+        file.write_bytes(scene.numpy().tobytes())
+        for name in args.configs:
+            model = make_model(name)
+            check(name, model, scene, bench.device)
+            plain, detector = copy.deepcopy(model).to(bench.device), Detector(model, bench.device)
+            for batch in args.batch:
+                points, sample = scene.repeat(batch, 1).to(bench.device), samples([scene] * batch).to(bench.device)
+                times: dict[str, list[float]] = {"plain model": []}
+                repeat = args.repeat if batch == 1 else max(3, args.repeat // batch)
+                for turn in range(repeat + 2):
+                    found = time_stages(detector, [file] * batch)
+                    synchronise(bench.device)
+                    begin = time.perf_counter()
+                    plain.detect(points, sample, batch)
+                    synchronise(bench.device)
+                    if turn >= 2:  # two to warm up
+                        times["plain model"].append(time.perf_counter() - begin)
+                        for stage, seconds in found.items():
+                            times.setdefault(stage, []).append(seconds)
+                title = f"{name}, batch {batch}, {str(detector.dtype).removeprefix('torch.')}"
+                print(f"\n{title:<36}{'p50':>10}{'p95':>10} ms a call {'frames/s':>10}{'ratio':>8}")
+                whole = float(np.median(times["detector"]))
+                for stage in (*STAGES, "detector", "plain model"):
+                    p50, p95 = (1e3 * float(value) for value in np.percentile(times[stage], (50, 95)))
+                    total = stage in ("detector", "plain model")
+                    rate = f"{1e3 * batch / p50:10.1f}{p50 / (1e3 * whole):7.2f}x" if total else ""
+                    print(f"  {stage:<34}{p50:10.2f}{p95:10.2f}           {rate}")
+                    row = {"config": name, "batch": batch, "dtype": str(detector.dtype), "stage": stage}
+                    rows.append(row | {"p50_ms": f"{p50:.6g}", "p95_ms": f"{p95:.6g}", "calls": repeat})
+                sys.stdout.flush()
+    args.csv.parent.mkdir(parents=True, exist_ok=True)
+    with args.csv.open("w", newline="", encoding="utf-8") as table:
+        writer = csv.DictWriter(table, [*rows[0], *bench.machine])
+        writer.writeheader()
+        writer.writerows(row | bench.machine for row in rows)
+    print(f"\nwritten: {args.csv}")
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,225 @@
+"""Inference: a trained model made ready for a device, stage by stage from a cloud to its boxes.
+
+Batch norms are folded into the convolutions, the encoder is the fused one, backbone and heads run in bfloat16 where the
+device is faster with it, and only the anchors whose score is above the threshold are regressed and decoded. On a GPU
+everything up to the scores is one CUDA graph, and the boxes come to the host in one transfer.
+"""
+
+import copy
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from hvnet.anchors import anchors_per_cell, decode
+from hvnet.encoder import FusedEncoder
+from hvnet.head import Head
+from hvnet.kernels.rotated import nms_order
+from hvnet.model import Detections, HVNet, load_checkpoint, model_from_checkpoint, select_device
+
+SHIPPED = Path(__file__).resolve().parent / "weights" / "compact.pt"
+"""The weights that come with the package: see docs/model_card.md."""
+
+
+class Candidates(NamedTuple):
+    """The anchors of a class and a sample that go into NMS; those that are not valid only fill up the array."""
+
+    boxes: Tensor  # (K, 7)
+    scores: Tensor  # (K,)
+    valid: Tensor  # (K,) bool
+
+
+class Detector:
+    """A trained model on a device: `detector(points)` gives the boxes of one cloud.
+
+    The model is copied; training it further does not change the detector.
+    """
+
+    def __init__(self, model: HVNet, device: torch.device, dtype: torch.dtype | None = None) -> None:
+        self.device = device
+        self.dtype = dtype or fastest_dtype(device)
+        self.config = model.config
+        self.entries = model.config.head.classes
+        self.classes = tuple(entry.name for entry in model.config.head.classes)
+        model = copy.deepcopy(model).to(device).eval()
+        self.encoder = FusedEncoder(model.encoder)
+        self.backbone = fold_batch_norms(model.backbone).to(dtype=self.dtype)
+        heads = [head for head in model.heads if isinstance(head, Head)]
+        self.scores = [copy.deepcopy(head.score).to(dtype=self.dtype) for head in heads]
+        self.regressions = [regression_weight(head) for head in heads]
+        self.anchors = [model.anchors(label) for label in range(len(heads))]
+        self.graphs: dict[tuple[int, int], Graph] = {}
+
+    def __call__(self, points: Tensor | NDArray) -> Detections:
+        """Points (N, 4), x, y, z in metres and reflectance in [0, 1], to boxes (M, 7), scores (M,), labels (M,).
+
+        Points outside the range and points that are not finite take no part. The results lie on the host.
+        """
+        return self.batch([points])[0]
+
+    @torch.no_grad()
+    def batch(self, clouds: Sequence[Tensor | NDArray]) -> list[Detections]:
+        """The boxes of several clouds, detected together."""
+        parts = [torch.as_tensor(cloud, dtype=torch.float32, device=self.device) for cloud in clouds]
+        for part in parts:
+            if part.ndim != 2 or part.shape[1] != 4:
+                raise ValueError(f"points: want shape (N, 4) with x, y, z, reflectance, got {tuple(part.shape)}")
+        points = torch.cat(parts)
+        lengths = torch.tensor([len(part) for part in parts])
+        sample = torch.repeat_interleave(torch.arange(len(parts)), lengths).to(self.device)
+        levels, logits = self.maps(points, sample, len(parts))
+        return self.suppress(self.candidates(levels, logits))
+
+    def maps(self, points: Tensor, sample: Tensor, batch_size: int) -> tuple[list[Tensor], list[Tensor]]:
+        """Pyramid levels (B, C, N_L, N_W) / 2^k and the logits (B, A) of every class; on a GPU by a CUDA graph."""
+        if self.device.type != "cuda" or not self.encoder.is_nested(batch_size):
+            return self.score(self.backbone(self.encode(points, sample, batch_size)))
+        # the graph is for a number of points: the next power of two, filled up with points that are outside
+        capacity = max(1 << (len(points) - 1).bit_length(), 1024) if len(points) else 1024
+        key = (batch_size, capacity)
+        if key not in self.graphs:
+            self.graphs[key] = Graph(self, batch_size, capacity)
+        return self.graphs[key](points, sample)
+
+    def encode(self, points: Tensor, sample: Tensor, batch_size: int) -> list[Tensor]:
+        """Pseudo-images, finest first, that hold until the next call."""
+        return self.encoder(points, sample, batch_size, self.dtype)
+
+    def score(self, levels: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+        """The pyramid levels, and the logits (B, A) float32 of every class."""
+        maps = [score(levels[entry.level]) for score, entry in zip(self.scores, self.entries, strict=True)]
+        return levels, [each.permute(0, 2, 3, 1).reshape(len(each), -1).float() for each in maps]
+
+    def candidates(self, levels: list[Tensor], logits: list[Tensor]) -> list[list[Candidates]]:
+        """For every sample and class the best anchors above the threshold, regressed and decoded."""
+        return [
+            [self._candidates(label, b, levels, of_class[b]) for label, of_class in enumerate(logits)]
+            for b in range(len(logits[0]))
+        ]
+
+    def _candidates(self, label: int, b: int, levels: list[Tensor], logits: Tensor) -> Candidates:
+        head, entry = self.config.head, self.entries[label]
+        if self.device.type == "cpu":
+            at = (logits.sigmoid() > head.score_threshold).nonzero().squeeze(1)
+            at = at[torch.sort(logits[at], descending=True, stable=True).indices[: head.candidates]]
+        else:  # as many for every cloud, so that no length is read from the device
+            at = logits.topk(min(head.candidates, len(logits))).indices
+        scores = logits[at].sigmoid()
+        values = regress(levels[entry.level][b], at, self.regressions[label], anchors_per_cell(entry))
+        direction = values[:, 10:].argmax(dim=1) if head.direction else None
+        boxes = decode(values[:, :8], values[:, 8:10], direction, self.anchors[label][at])
+        return Candidates(boxes, scores, scores > head.score_threshold)
+
+    def suppress(self, candidates: list[list[Candidates]]) -> list[Detections]:
+        """Rotated NMS class by class, and the one transfer to the host."""
+        head = self.config.head
+        rows, lengths = [], []
+        for of_sample in candidates:
+            for label, (boxes, scores, valid) in enumerate(of_sample):
+                scores = scores.where(valid, -1.0)  # after all others
+                order, keep = nms_order(boxes, scores, self.entries[label].nms_iou)
+                keep = keep & valid[order]
+                keep = keep & (keep.cumsum(0) <= head.detections)
+                columns = (scores[order], torch.full_like(scores, label), keep.float())
+                rows.append(torch.cat((boxes[order], torch.stack(columns, dim=1)), dim=1))
+                lengths.append(len(order))
+        found = torch.cat(rows).cpu().split(lengths)
+        classes = len(self.classes)
+        samples = [torch.cat(found[k : k + classes]) for k in range(0, len(found), classes)]
+        kept = [rows[rows[:, 9] > 0] for rows in samples]
+        return [Detections(rows[:, :7], rows[:, 7], rows[:, 8].long()) for rows in kept]
+
+
+class Graph:
+    """The CUDA graph of encoder, backbone and scores for a batch size and a number of points."""
+
+    def __init__(self, detector: Detector, batch_size: int, capacity: int) -> None:
+        self.points = torch.full((capacity, 4), torch.nan, device=detector.device)  # not finite, hence outside
+        self.sample = torch.zeros(capacity, dtype=torch.int64, device=detector.device)
+
+        def run() -> tuple[list[Tensor], list[Tensor]]:
+            return detector.score(detector.backbone(detector.encode(self.points, self.sample, batch_size)))
+
+        side = torch.cuda.Stream(detector.device)
+        side.wait_stream(torch.cuda.current_stream(detector.device))
+        with torch.cuda.stream(side):
+            for _ in range(2):  # kernels are compiled and buffers made before the capture
+                run()
+        torch.cuda.current_stream(detector.device).wait_stream(side)
+        self.graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self.graph):
+            self.outputs = run()
+
+    def __call__(self, points: Tensor, sample: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+        """What `Detector.maps` returns, for at most as many points as the graph has room for."""
+        self.points[: len(points)] = points
+        self.points[len(points) :] = torch.nan
+        self.sample[: len(sample)] = sample
+        self.graph.replay()
+        return self.outputs
+
+
+def fastest_dtype(device: torch.device) -> torch.dtype:
+    """bfloat16 where the processor multiplies in it, else float32."""
+    if device.type == "cuda":
+        return torch.bfloat16 if torch.cuda.is_bf16_supported(including_emulation=False) else torch.float32
+    return torch.bfloat16 if torch.cpu._is_avx512_bf16_supported() else torch.float32
+
+
+def fold_batch_norms(module: nn.Module) -> nn.Module:
+    """A copy in which each convolution followed by a batch norm is one convolution."""
+    if isinstance(module, nn.Sequential):
+        layers: list[nn.Module] = []
+        for layer in module:
+            if isinstance(layer, nn.BatchNorm2d):
+                convolution = layers.pop()
+                assert isinstance(convolution, nn.Conv2d | nn.ConvTranspose2d)
+                transposed = isinstance(convolution, nn.ConvTranspose2d)
+                layers.append(fuse_conv_bn_eval(convolution, layer, transposed))
+            else:
+                layers.append(fold_batch_norms(layer))
+        return nn.Sequential(*layers)
+    folded = copy.copy(module)
+    folded._modules = {name: child and fold_batch_norms(child) for name, child in module._modules.items()}
+    return folded
+
+
+def regression_weight(head: Head) -> Tensor:
+    """All branches of a head but the score as one matrix (9 C + 1, N_anc * values): 3 x 3 cells, then the bias."""
+    branches = [branch for branch in (head.corners, head.vertical, head.direction) if branch is not None]
+    anchors = head.score.weight.shape[0]
+    parts = []
+    for branch in branches:
+        assert branch.bias is not None
+        weight = branch.weight.permute(2, 3, 1, 0).flatten(0, 2)  # (9 C, N_anc * values)
+        whole = torch.cat((weight, branch.bias[None]))
+        parts.append(whole.view(len(whole), anchors, -1))
+    return torch.cat(parts, dim=2).flatten(1).detach().float()
+
+
+def regress(level: Tensor, at: Tensor, weight: Tensor, anchors: int) -> Tensor:
+    """What a head's 3 x 3 convolutions say of the anchors at (K,) of a level (C, N_L, N_W): (K, values) float32."""
+    channels, n_l, n_w = level.shape
+    rows = level.permute(1, 2, 0).reshape(-1, channels)
+    cell = at // anchors
+    step = torch.arange(-1, 2, device=at.device)
+    x = (cell // n_w)[:, None, None] + step[:, None]
+    y = (cell % n_w)[:, None, None] + step
+    inside = (x >= 0) & (x < n_l) & (y >= 0) & (y < n_w)
+    patches = rows[(x.clamp(0, n_l - 1) * n_w + y.clamp(0, n_w - 1)).flatten()].float().view(len(at), 9, channels)
+    patches = patches * inside.view(len(at), 9, 1)
+    values = torch.addmm(weight[-1], patches.flatten(1), weight[:-1]).view(len(at), anchors, weight.shape[1] // anchors)
+    return values[torch.arange(len(at), device=at.device), at % anchors]
+
+
+def load(checkpoint: str | Path | None = None, device: str = "auto") -> Detector:
+    """A detector from a checkpoint of `python -m hvnet.train`, by default from the weights that come with the package.
+
+    Raises InputError naming the file.
+    """
+    path = SHIPPED if checkpoint is None else checkpoint
+    return Detector(model_from_checkpoint(load_checkpoint(path), str(path)), select_device(device))

@@ -1,0 +1,94 @@
+"""Several processes that train one model together, each a rank: started by torchrun, or one process alone."""
+
+import os
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+
+def start(device: torch.device) -> torch.device:
+    """Joins the processes that torchrun started, if it did; returns the device of this one."""
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        if device.type == "cuda":
+            device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+            torch.cuda.set_device(device)
+        dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    return device
+
+
+def stop() -> None:
+    """Leaves the other processes."""
+    if dist.is_initialized():
+        dist.destroy_process_group()
+
+
+def size() -> int:
+    """The number of processes."""
+    return dist.get_world_size() if dist.is_initialized() else 1
+
+
+def rank() -> int:
+    """The number of this process; 0 prints and writes."""
+    return dist.get_rank() if dist.is_initialized() else 0
+
+
+def of_first(value: Any) -> Any:
+    """The value that rank 0 gives; the others wait for it."""
+    if size() == 1:
+        return value
+    values = [value]
+    dist.broadcast_object_list(values)
+    return values[0]
+
+
+def gathered(value: Any) -> list[Any]:
+    """The values of all ranks, on every rank."""
+    if size() == 1:
+        return [value]
+    values: list[Any] = [None] * size()
+    dist.all_gather_object(values, value)
+    return values
+
+
+class _Joined(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, value: Tensor) -> Tensor:
+        total = value.clone()
+        dist.all_reduce(total)
+        return total
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        total = grads[0].clone()
+        dist.all_reduce(total)
+        return total
+
+
+def joined(value: Tensor) -> Tensor:
+    """The sum of a tensor over all ranks; the gradient is that of the sum of what all ranks make of it."""
+    return _Joined.apply(value) if size() > 1 else value
+
+
+class BatchNorm2d(nn.BatchNorm2d):
+    """A batch norm over the batch of all ranks together."""
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Features (B, C, H, W) normalised."""
+        if not self.training or size() == 1:
+            return super().forward(features)
+        wide = features.float()
+        variance, mean = torch.var_mean(wide, dim=(0, 2, 3), correction=0)
+        count = torch.full_like(mean[:1], wide[:, 0].numel())
+        total = joined(torch.cat((count, count * mean)))
+        joint = total[1:] / total[0]
+        squares = joined(count * (variance + (mean - joint).square()))
+        with torch.no_grad():
+            momentum = self.momentum or 0.1
+            self.get_buffer("running_mean").lerp_(joint, momentum)
+            self.get_buffer("running_var").lerp_(squares / (total[0] - 1), momentum)
+            self.get_buffer("num_batches_tracked").add_(1)
+        scale = self.weight * torch.rsqrt(squares / total[0] + self.eps)
+        shift = self.bias - joint * scale
+        return (wide * scale[:, None, None] + shift[:, None, None]).to(features.dtype)
