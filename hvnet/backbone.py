@@ -4,13 +4,14 @@ import torch
 from torch import Tensor, nn
 
 from hvnet.config import BackboneConfig
+from hvnet.ranks import BatchNorm2d
 
 
 def conv_bn_relu(in_channels: int, out_channels: int, kernel: int, stride: int = 1) -> nn.Sequential:
     """Convolution that keeps the size (divided by the stride), batch norm, ReLU."""
     return nn.Sequential(
         nn.Conv2d(in_channels, out_channels, kernel, stride, padding=kernel // 2, bias=False),
-        nn.BatchNorm2d(out_channels),
+        BatchNorm2d(out_channels),
         nn.ReLU(inplace=True),
     )
 
@@ -19,7 +20,7 @@ def deconv_bn_relu(in_channels: int, out_channels: int, stride: int) -> nn.Seque
     """Transposed convolution that enlarges a map `stride` times, batch norm, ReLU."""
     return nn.Sequential(
         nn.ConvTranspose2d(in_channels, out_channels, stride, stride, bias=False),
-        nn.BatchNorm2d(out_channels),
+        BatchNorm2d(out_channels),
         nn.ReLU(inplace=True),
     )
 

@@ -117,6 +117,8 @@ class TrainConfig:
     pictures: int = 4  # validation frames drawn
     workers: int = 0  # processes that read and augment
     bfloat16: bool = False  # backbone and heads in bfloat16; the encoder stays in float32
+    skip_corrupt: bool = False  # name a frame that cannot be read and take the next one, instead of stopping
+    skip_non_finite: bool = False  # note a step whose loss is not finite and leave it out, instead of stopping
     train_split: str = "train"
     val_split: str = "val"
     seed: int = 0

@@ -21,6 +21,7 @@ from hvnet.kernels.encode import (
 )
 from hvnet.kernels.scatter import Segments, segment_add, segment_mean
 from hvnet.kernels.voxel import Grid, Voxels, is_nested, make_grid, nested_index, voxel_index
+from hvnet.ranks import joined, size
 
 POINT_CHANNELS = 4  # d: x, y, z, reflectance
 
@@ -52,6 +53,11 @@ def moments(rows: Tensor) -> Tensor:
     """Sums of products of the columns of rows (R, k), the last of them 1, in float64: (k, k)."""
     wide = rows.double()
     return wide.T @ wide
+
+
+def has_variance(training: bool, rows: int) -> bool:
+    """Whether a batch of so many rows gives the statistics of a batch norm; of several ranks, together they do."""
+    return training and (rows > 1 or size() > 1)
 
 
 def folded(linear: nn.Linear, norm: nn.BatchNorm1d, of_rows: Tensor | None) -> Tensor:
@@ -115,8 +121,8 @@ class AttentiveVFE(nn.Module):
         M is (N, q), or (0, q) unless it is to be kept, G' (V, q).
         """
         of_rows = None
-        if self.training and points.shape[0] > 1:
-            of_rows = torch.stack([scale.moments for scale in voxels]).sum(dim=0)
+        if has_variance(self.training, points.shape[0]):
+            of_rows = joined(torch.stack([scale.moments for scale in voxels]).sum(dim=0))
         layer = torch.vstack((folded(self.knowledge, self.knowledge_norm, of_rows), norm))
         return [attend(features, points, scale.mean, layer, scale.segments, self.relu, keep) for scale in voxels]
 
@@ -154,7 +160,8 @@ class HybridVoxelEncoder(nn.Module):
     def point_features(self, points: Tensor, scales: dict[Grid, ScaleOfPoints]) -> list[tuple[Tensor, Tensor]]:
         """AVFE: points (N, d) to M (N, q) and G' (V, q) of every feature scale."""
         ones = torch.ones_like(points[:, :1])
-        of_rows = moments(torch.cat((points, ones), dim=1)) if self.training and points.shape[0] > 1 else None
+        training = has_variance(self.training, points.shape[0])
+        of_rows = joined(moments(torch.cat((points, ones), dim=1))) if training else None
         weight = folded(self.avfe.features, self.avfe.features_norm, of_rows)
         features = torch.addmm(weight[-1], points, weight[:-1])
         as_it_is = torch.vstack((torch.ones_like(weight[-1]), torch.zeros_like(weight[-1])))
@@ -185,19 +192,20 @@ def scale_of_points(points: Tensor, voxels: Voxels) -> ScaleOfPoints:
 
 
 def batch_norm(norm: nn.BatchNorm1d, rows: Tensor) -> Tensor:
-    """Scale and shift (2, C) of the batch norm of rows (N, C), from sums that no number of threads changes.
+    """Scale and shift (2, C) of the batch norm of all ranks' rows (N, C), from sums that no number of threads changes.
 
     A batch of fewer than two rows has no variance and takes the running one.
     """
-    count = rows.shape[0]
-    if not norm.training or count < 2:
+    if not has_variance(norm.training, rows.shape[0]):
         mean, variance = norm.get_buffer("running_mean"), norm.get_buffer("running_var")
     else:
         total, squares = column_sums(rows)
+        sums = joined(torch.cat((total, squares, torch.full_like(total[:1], rows.shape[0]))))
+        (total, squares), count = sums[:-1].chunk(2), sums[-1].detach()
         mean = total / count
         variance = (squares / count - mean.square()).clamp(min=0).to(rows.dtype)
         mean = mean.to(rows.dtype)
-        update_statistics(norm, mean.detach(), variance.detach() * (count / (count - 1)))
+        update_statistics(norm, mean.detach(), variance.detach() * (count / (count - 1)).to(rows.dtype))
     scale = norm.weight * torch.rsqrt(variance + norm.eps)
     return torch.vstack((scale, norm.bias - mean * scale))
 

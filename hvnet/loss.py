@@ -7,6 +7,7 @@ from torch import Tensor
 from hvnet.anchors import Targets
 from hvnet.config import ClassConfig, LossConfig
 from hvnet.head import HeadMaps
+from hvnet.ranks import joined
 
 
 def focal_loss(logits: Tensor, positive: Tensor, negative: Tensor, alpha: float, gamma: float) -> Tensor:
@@ -17,8 +18,8 @@ def focal_loss(logits: Tensor, positive: Tensor, negative: Tensor, alpha: float,
 
 
 def class_loss(maps: HeadMaps, targets: Targets, entry: ClassConfig, weights: LossConfig) -> dict[str, Tensor]:
-    """The weighted terms of one class, each divided by max(1, positives of the class in the batch)."""
-    positives = targets.positive.sum().clamp(min=1)
+    """The weighted terms of one class, each divided by max(1, positives of the class in the batch of all ranks)."""
+    positives = joined(targets.positive.sum()).clamp(min=1)
     focal = focal_loss(maps.logits, targets.positive, targets.negative, entry.focal_alpha, entry.focal_gamma)
     at = targets.positive
     terms = {

@@ -1,5 +1,6 @@
 """HVNet: encoder, backbone and one head a class; `forward` returns maps, `detect` returns boxes."""
 
+import os
 import pickle
 from pathlib import Path
 from typing import NamedTuple
@@ -92,10 +93,22 @@ class HVNet(nn.Module):
 
 
 def save_checkpoint(path: Path, content: dict) -> None:
-    """Writes a checkpoint atomically: a stopped run leaves the old file or the new one, never half of one."""
+    """Writes a checkpoint atomically: whatever happens, there is the old file or the new one, never half of one.
+
+    Raises InputError naming the file if it cannot be written.
+    """
     partial = path.with_suffix(".partial")
-    torch.save(content, partial)
-    partial.replace(path)
+    try:
+        with partial.open("wb") as file:
+            torch.save(content, file)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except (OSError, RuntimeError) as error:  # torch's writer turns some errors of the system into RuntimeError
+        partial.unlink(missing_ok=True)
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        kept = "; what it held before is whole: make room and --resume" if path.is_file() else ""
+        raise InputError(f"{path}: cannot be written ({reason}){kept}") from error
 
 
 def load_checkpoint(path: str | Path) -> dict:

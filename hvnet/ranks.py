@@ -1,6 +1,7 @@
 """Several processes that train one model together, each a rank: started by torchrun, or one process alone."""
 
 import os
+import warnings
 from typing import Any
 
 import torch
@@ -92,3 +93,13 @@ class BatchNorm2d(nn.BatchNorm2d):
         scale = self.weight * torch.rsqrt(squares / total[0] + self.eps)
         shift = self.bias - joint * scale
         return (wide * scale[:, None, None] + shift[:, None, None]).to(features.dtype)
+
+
+def parallel(model: nn.Module) -> nn.Module:
+    """The model with gradients that are averaged over the ranks; alone, the model itself."""
+    if size() == 1:
+        return model
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # torch 2.13 has another name for broadcast_buffers
+        # a pyramid level that no class uses has no gradient; buffers are the same on every rank
+        return nn.parallel.DistributedDataParallel(model, find_unused_parameters=True, broadcast_buffers=False)

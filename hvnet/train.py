@@ -1,11 +1,19 @@
-"""Training, from top to bottom: `python -m hvnet.train`. Without arguments it trains the demo on generated scenes."""
+"""Training, from top to bottom: `python -m hvnet.train`. Without arguments it trains the demo on generated scenes.
+
+On a GPU the frames, the database and the augmentation live on the device. Several processes, started by torchrun, train
+one model together: each takes its share of every batch, and rank 0 prints and writes.
+"""
 
 import argparse
+import contextlib
 import hashlib
 import json
 import math
 import os
-from collections.abc import Iterator, Sequence
+import shutil
+import signal
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,12 +24,13 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
+from hvnet import ranks
 from hvnet.cli import InputError, run_command
 from hvnet.config import Config, TrainConfig, config_to_dict, load_config
-from hvnet.data.augment import augment, mix_sectors
+from hvnet.data.augment import Objects, augment, mix_sectors, objects_of
 from hvnet.data.database import FILE_NAME, Database, build_database, read_database, write_database
 from hvnet.data.kitti import (
-    Frame,
+    Labels,
     detections_to_labels,
     read_calibration,
     read_frame,
@@ -36,8 +45,14 @@ from hvnet.evaluate import CLASSES, evaluate, format_table
 from hvnet.model import HVNet, load_checkpoint, save_checkpoint, select_device
 
 DEMO = Path(__file__).resolve().parent.parent / "configs" / "demo.yaml"
-CHANGEABLE = [f"train.{key}" for key in ("epochs", "learning_rate", "validate_every", "pictures", "workers")]
+CHANGEABLE = [
+    f"train.{key}"
+    for key in ("epochs", "learning_rate", "validate_every", "pictures", "workers", "skip_corrupt", "skip_non_finite")
+]
 """What may differ from the run that --resume takes up."""
+
+ROOM = 100 * 2**20
+"""Bytes beside the checkpoints that a run may need on the disk."""
 
 
 class Batch(NamedTuple):
@@ -48,58 +63,92 @@ class Batch(NamedTuple):
     boxes: list[Tensor]  # (M_b, 7) each
     labels: list[Tensor]  # (M_b,) int64 each, index into the config's classes
     notes: list[str]  # what is to be said of the frames' files, once
+    names: list[str]  # of the frames
 
     def to(self, device: torch.device) -> "Batch":
         """The batch on a device."""
         boxes, labels = [b.to(device) for b in self.boxes], [at.to(device) for at in self.labels]
-        return Batch(self.points.to(device), self.sample.to(device), boxes, labels, self.notes)
+        return self._replace(points=self.points.to(device), sample=self.sample.to(device), boxes=boxes, labels=labels)
 
 
-Sample = tuple[Tensor, Tensor, Tensor, str]
+class Sample(NamedTuple):
+    """One frame."""
+
+    points: Tensor  # (N, 4), on a GPU where it is trained on one
+    boxes: Tensor  # (M, 7)
+    labels: Tensor  # (M,) int64, index into the config's classes, or -1
+    note: str
+    name: str
 
 
 class TrainingFrames(Dataset[Sample]):
-    """The frames of a split, augmented; item (epoch, k) depends on the seed, the epoch and k alone."""
+    """The frames of a split, augmented on a device; item (epoch, k) depends on the seed, the epoch and k alone."""
 
-    def __init__(self, root: Path, ids: list[str], config: Config, database: Database | None) -> None:
-        self.root, self.ids, self.config, self.database = root, ids, config, database
+    def __init__(
+        self, root: Path, ids: list[str], config: Config, objects: Objects | None, device: torch.device
+    ) -> None:
+        self.root, self.ids, self.config, self.objects, self.device = root, ids, config, objects, device
         self.classes = [entry.name for entry in config.head.classes]
-        self.kept: dict[int, Frame] = {}
+        self.kept: dict[int, Sample] = {}
 
     def __getitem__(self, item: tuple[int, int]) -> Sample:
         epoch, k = item
         options = self.config.augment
         generator = seeded(self.config.train.seed, epoch, k)
-        points, boxes, labels, note = self.read(k % len(self.ids))
+        frame = self.read(k % len(self.ids))
+        points, boxes, labels = frame.points, frame.boxes, frame.labels
         if options.mix and torch.rand((), generator=generator).item() < options.mix:
-            other = int(torch.randint(len(self.ids), (), generator=generator))
-            points, boxes, labels = mix_sectors(points, boxes, labels, self.read(other)[:3], generator)
-        points, boxes, labels = augment(points, boxes, labels, self.database, options, generator, self.classes)
+            other = self.read(int(torch.randint(len(self.ids), (), generator=generator)))
+            others = (other.points, other.boxes, other.labels)
+            points, boxes, labels = mix_sectors(points, boxes, labels, others, generator)
+        points, boxes, labels = augment(points, boxes, labels, self.objects, options, generator, self.classes)
         low, high = boxes.new_tensor(self.config.encoder.point_range).view(2, 3)
         inside = ((boxes[:, :2] >= low[:2]) & (boxes[:, :2] < high[:2])).all(dim=1) & (labels >= 0)
-        return points, boxes[inside], labels[inside], note
+        return Sample(points, boxes[inside], labels[inside], frame.note, frame.name)
 
     def read(self, k: int) -> Sample:
-        """Frame k as it is; boxes of classes that are not trained have label -1."""
-        frame = self.kept.get(k) or read_frame(self.root, self.ids[k])
-        if self.config.train.workers == 0:  # read once; several workers would each keep all frames
-            self.kept[k] = frame
+        """Frame k as it is; boxes of classes that are not trained have label -1.
+
+        Where frames that cannot be read are to be skipped, the next one that can be takes the place.
+        """
+        notes = ""
+        for name in self.ids[k:] + self.ids[:k]:
+            if k in self.kept:
+                return self.kept[k]
+            try:
+                frame = read_frame(self.root, name)
+                break
+            except (InputError, OSError) as error:
+                if not self.config.train.skip_corrupt:
+                    raise
+                notes += f"frame {name} is skipped: {error}\n"
+        else:
+            raise InputError(f"{self.root}: no frame can be read; the last: {notes.splitlines()[-1]}")
         labels = torch.tensor([self.classes.index(n) if n in self.classes else -1 for n in frame.names]).long()
-        return frame.points, frame.boxes, labels, frame.note
+        note = (notes + (frame.note or "")).strip()
+        sample = Sample(frame.points.to(self.device), frame.boxes, labels, note, name)
+        if self.config.train.workers == 0:  # read once; several workers would each keep all frames
+            self.kept[k] = sample
+        return sample
 
 
-class EpochOrder(Sampler[tuple[int, int]]):
-    """The items (epoch, k) of an epoch, shuffled by seed and epoch."""
+class EpochOrder(Sampler[list[tuple[int, int]]]):
+    """Batches of items (epoch, k), shuffled by seed and epoch: of each, from the batch `begin` on, a rank's share.
 
-    def __init__(self, count: int, seed: int) -> None:
-        self.count, self.seed, self.epoch = count, seed, 0
+    The last frames of an epoch that do not fill a batch are left out, unless there are no others.
+    """
+
+    def __init__(self, count: int, batch_size: int, seed: int) -> None:
+        self.count, self.batch_size, self.seed, self.epoch, self.begin = count, batch_size, seed, 0, 0
 
     def __len__(self) -> int:
-        return self.count
+        return max(1, self.count // self.batch_size)
 
-    def __iter__(self) -> Iterator[tuple[int, int]]:
+    def __iter__(self) -> Iterator[list[tuple[int, int]]]:
         order = torch.randperm(self.count, generator=seeded(self.seed, self.epoch)).tolist()
-        return iter([(self.epoch, k) for k in order])
+        for batch in range(self.begin, len(self)):
+            items = order[batch * self.batch_size : (batch + 1) * self.batch_size]
+            yield [(self.epoch, k) for k in items[ranks.rank() :: ranks.size()]]
 
 
 def seeded(*numbers: int) -> torch.Generator:
@@ -120,9 +169,9 @@ def say_once(notes: list[str], said: set[str]) -> None:
 
 def collate(samples: Sequence[Sample]) -> Batch:
     """Joins samples into a batch."""
-    points, boxes, labels, notes = zip(*samples, strict=True)
+    points, boxes, labels, notes, names = zip(*samples, strict=True)
     sample = torch.repeat_interleave(torch.arange(len(points)), torch.tensor([len(p) for p in points]))
-    return Batch(torch.cat(points), sample, list(boxes), list(labels), list(notes))
+    return Batch(torch.cat(points), sample, list(boxes), list(labels), list(notes), list(names))
 
 
 def learning_rate(config: TrainConfig, step: int, epoch: int, steps: int) -> float:
@@ -148,73 +197,143 @@ def read_batches(loader: DataLoader) -> Iterator[Batch]:
         raise InputError(str(error).strip().splitlines()[-1].removeprefix("hvnet.cli.InputError: ")) from error
 
 
+class Progress(NamedTuple):
+    """How far a run has come, and the sums of its losses in the epoch that is under way."""
+
+    epoch: int = 0  # epochs done
+    batch: int = 0  # batches done of the next one
+    step: int = 0
+    sums: dict[str, float] | None = None
+
+
 def train_epoch(
-    model: HVNet, optimizer: torch.optim.Optimizer, loader: DataLoader, epoch: int, step: int, said: set[str]
-) -> tuple[dict[str, float], int]:
-    """One epoch from a step on; returns the mean of every loss and the step that comes next."""
+    model: HVNet,
+    optimizer: torch.optim.Optimizer,
+    loader: DataLoader,
+    progress: Progress,
+    out: Path,
+    said: set[str],
+    signals: list[int],
+) -> Progress:
+    """The rest of an epoch; it ends early if a signal has come."""
     device = next(model.parameters()).device
     config = model.config.train
     model.train()
-    sums: dict[str, Tensor] = {}
-    count = 0
-    title = f"epoch {epoch + 1}/{config.epochs}"
-    bar = tqdm(read_batches(loader), total=len(loader), desc=title, unit="batch", leave=False, dynamic_ncols=True)
+    joint = ranks.parallel(model)
+    epoch, batches, step = progress.epoch, progress.batch, progress.step
+    sums = dict(progress.sums or {})
+    assert isinstance(loader.batch_sampler, EpochOrder)
+    loader.batch_sampler.epoch, loader.batch_sampler.begin = epoch, batches
+    bar = tqdm(
+        read_batches(loader),
+        total=len(loader),
+        initial=batches,
+        desc=f"epoch {epoch + 1}/{config.epochs}",
+        unit="batch",
+        leave=False,
+        dynamic_ncols=True,
+        disable=ranks.rank() > 0,
+    )
     for batch in bar:
         for group in optimizer.param_groups:
             group["lr"] = learning_rate(config, step, epoch, config.epochs * len(loader))
         say_once(batch.notes, said)
         batch = batch.to(device)
-        terms = model.loss(model(batch.points, batch.sample, len(batch.boxes)), batch.boxes, batch.labels)
+        terms = model.loss(joint(batch.points, batch.sample, len(batch.boxes)), batch.boxes, batch.labels)
         loss = torch.stack(list(terms.values())).sum()
         optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        (ranks.size() * loss).backward()  # the ranks' gradients are averaged, the loss is their sum
         norm = torch.nn.utils.clip_grad_norm_(model.parameters(), config.gradient_clip)
-        if not math.isfinite(loss.item() + norm.item()):
-            what = f"the loss is {loss.item()} and its gradient's norm {norm.item()} at step {step}"
-            raise InputError(f"{what}; lower train.learning_rate and --resume")
-        optimizer.step()
-        step, count = step + 1, count + 1
-        for name, term in {"loss": loss, **terms}.items():
-            sums[name] = sums.get(name, torch.zeros((), device=device)) + term.detach()
-        bar.set_postfix(loss=f"{loss.item():.3f}", frames=f"{config.batch_size * (bar.format_dict['rate'] or 0):.1f}/s")
-    return {name: total.item() / count for name, total in sums.items()}, step
+        parts = torch.stack([loss, *terms.values(), torch.full_like(loss, len(signals))]).detach()
+        *losses, stop = ranks.joined(parts).tolist()
+        if math.isfinite(losses[0] + norm.item()):
+            optimizer.step()
+            for name, value in zip(("loss", *terms), losses, strict=True):
+                sums[name] = sums.get(name, 0.0) + value
+            sums["batches"] = sums.get("batches", 0.0) + 1
+        else:
+            note_non_finite(out, epoch, step, losses[0], norm.item(), batch.names, config.skip_non_finite)
+        step, batches = step + 1, batches + 1
+        bar.set_postfix(loss=f"{losses[0]:.3f}", frames=f"{config.batch_size * (bar.format_dict['rate'] or 0):.1f}/s")
+        if stop and batches < len(loader):
+            bar.close()
+            return Progress(epoch, batches, step, sums)
+    return Progress(epoch + 1, 0, step, sums)
+
+
+def note_non_finite(out: Path, epoch: int, step: int, loss: float, norm: float, names: list[str], skip: bool) -> None:
+    """Keeps the frames of a step whose loss or gradient is not finite in non_finite.jsonl, and ends the run or not."""
+    names = [name for share in ranks.gathered(names) for name in share]
+    path = out / "non_finite.jsonl"
+    if ranks.rank() == 0:
+        with path.open("a", encoding="utf-8") as file:
+            line = {"epoch": epoch + 1, "step": step, "loss": str(loss), "gradient": str(norm), "frames": names}
+            file.write(json.dumps(line) + "\n")
+    what = f"the loss is {loss} and its gradient's norm {norm} at step {step}"
+    if not skip:
+        raise InputError(
+            f"{what}; its frames are in {path}; lower train.learning_rate, or set train.skip_non_finite, and --resume"
+        )
+    if ranks.rank() == 0:
+        tqdm.write(f"{what}: left out; its frames are in {path}")
 
 
 def validate(model: HVNet, root: Path, ids: list[str], pictures: Path, said: set[str]) -> dict[str, dict[str, Any]]:
-    """Detects in the frames of a split and scores the boxes as KITTI does; draws the first few into a folder."""
-    device = next(model.parameters()).device
-    classes = [entry.name for entry in model.config.head.classes]
-    detector = Detector(model, device)
-    labels, predictions = [], []
-    for k, name in enumerate(tqdm(ids, desc="validating", unit="frame", leave=False, dynamic_ncols=True)):
+    """Detects in the frames of a split and scores the boxes as KITTI does; draws the first few into a folder.
+
+    Each rank takes its share of the frames; the scores are those of all.
+    """
+    detector = Detector(model, next(model.parameters()).device)
+    classes = list(detector.classes)
+    found_here: list[tuple[Labels, Labels]] = []
+    for k in trange_of_rank(len(ids)):
+        name = ids[k]
         frame = read_frame(root, name)
         say_once([frame.note], said)
         found = detector(frame.points)
         names = [classes[label] for label in found.labels.tolist()]
-        labels.append(frame.labels)
-        predictions.append(detections_to_labels(found.boxes, found.scores, names, frame.calib, frame.image_size))
+        rows = detections_to_labels(found.boxes, found.scores, names, frame.calib, frame.image_size)
+        found_here.append((frame.labels, rows))
         if k < model.config.train.pictures:
             truth = frame.boxes[[n in classes for n in frame.names]]
             point_range = model.config.encoder.point_range
             draw_bev(pictures / f"{name}.png", frame.points, point_range, truth, *found, classes, f"frame {name}")
-    return evaluate(labels, predictions, classes=classes)
+    shares = ranks.gathered(found_here)
+    both = [shares[k % len(shares)][k // len(shares)] for k in range(len(ids))]  # in the order of the frames
+    return evaluate([labels for labels, _ in both], [rows for _, rows in both], classes=classes)
 
 
-def train(config: Config, root: Path, out: Path, device: torch.device, resume: bool) -> None:
-    """Trains on a KITTI root, validates, and writes checkpoint.pt, metrics.jsonl, tensorboard/ and pictures/."""
+def trange_of_rank(count: int) -> Iterable[int]:
+    """Every so manieth number below count, this rank's share, with a progress bar."""
+    share = range(ranks.rank(), count, ranks.size())
+    hidden = ranks.rank() > 0
+    return tqdm(share, desc="validating", unit="frame", leave=False, dynamic_ncols=True, disable=hidden)
+
+
+def train(config: Config, root: Path, out: Path, device: torch.device, resume: bool, signals: list[int]) -> None:
+    """Trains on a KITTI root, validates, and writes checkpoint.pt, metrics.jsonl, tensorboard/ and pictures/.
+
+    If one of the `signals` comes, the run is saved after the step that is under way, and ends.
+    """
     make_deterministic(config.train.seed)
+    say = print if ranks.rank() == 0 else lambda *_, **__: None
+    batch_size = config.train.batch_size
+    if batch_size % ranks.size():
+        raise InputError(f"train.batch_size: want a multiple of the {ranks.size()} ranks, got {batch_size}")
     train_ids = read_split(root, config.train.train_split)
     val_ids = read_split(root, config.train.val_split)
-    for name in tqdm([*train_ids, *val_ids], desc="checking", unit="frame", leave=False, dynamic_ncols=True):
-        check_frame(root, name)
+    frames = hashlib.sha256(json.dumps([train_ids, val_ids]).encode()).hexdigest()
+    train_ids = check_frames(root, train_ids, config.train.skip_corrupt, say)
+    check_frames(root, val_ids, False, say)
     database = load_database(root, config, val_ids) if config.augment.objects else None
-    order = EpochOrder(config.train.repeat * len(train_ids), config.train.seed)
+    order = EpochOrder(config.train.repeat * len(train_ids), batch_size, config.train.seed)
+    # worker processes know no GPU; without them the frames lie on it
+    place = device if config.train.workers == 0 else torch.device("cpu")
     loader: DataLoader = DataLoader(
-        TrainingFrames(root, train_ids, config, database),
-        batch_size=config.train.batch_size,
-        sampler=order,
+        TrainingFrames(root, train_ids, config, objects_of(database, place) if database else None, place),
+        batch_sampler=order,
         collate_fn=collate,
-        drop_last=len(order) >= config.train.batch_size,
+        generator=torch.Generator(),  # or every epoch that is begun would draw from torch's own
         num_workers=config.train.workers,
         persistent_workers=config.train.workers > 0,
         # a forked worker would inherit Warp, CUDA and the threads of this process
@@ -224,38 +343,99 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
     optimizer = torch.optim.Adam(
         model.parameters(), lr=config.train.learning_rate, weight_decay=config.train.weight_decay
     )
-    frames = hashlib.sha256(json.dumps([train_ids, val_ids]).encode()).hexdigest()
-    first_epoch, step = restore(out / "checkpoint.pt", model, optimizer, frames) if resume else (0, 0)
-    print(f"{len(train_ids)} frames to train, {len(val_ids)} to validate, on {device}; the run is {out}", flush=True)
+    checkpoint = out / "checkpoint.pt"
+    progress = restore(checkpoint, model, optimizer, frames) if resume else Progress()
+    check_room(out, model)
+    say(f"{len(train_ids)} frames to train, {len(val_ids)} to validate, on {device}; the run is {out}", flush=True)
 
-    out.mkdir(parents=True, exist_ok=True)
-    metrics = keep_metrics(out / "metrics.jsonl", first_epoch)
-    board = SummaryWriter(str(out / "tensorboard"), purge_step=first_epoch + 1)
-    if not resume:
-        save_run(out, model, optimizer, frames, 0, 0)  # so that a run which fails in its first epoch can be resumed
+    board = None
+    if ranks.rank() == 0:
+        out.mkdir(parents=True, exist_ok=True)
+        keep_metrics(out / "metrics.jsonl", progress.epoch)
+        board = SummaryWriter(str(out / "tensorboard"), purge_step=progress.epoch + 1)
+        if not resume:
+            save_run(checkpoint, model, optimizer, frames, progress)  # a run that fails in its first epoch can go on
     said: set[str] = set()
-    for epoch in range(first_epoch, config.train.epochs):
-        order.epoch = epoch
-        losses, step = train_epoch(model, optimizer, loader, epoch, step, said)
-        print(
-            f"epoch {epoch + 1:3d}  " + "  ".join(f"{name} {value:.6f}" for name, value in losses.items()), flush=True
-        )
-        record: dict[str, Any] = {"epoch": epoch + 1, "step": step, **losses}
+    while progress.epoch < config.train.epochs:
+        epoch = progress.epoch
+        progress = train_epoch(model, optimizer, loader, progress, out, said, signals)
+        if progress.epoch == epoch:  # a signal came
+            if board:
+                save_run(checkpoint, model, optimizer, frames, progress)
+            say(f"stopped in epoch {epoch + 1} after step {progress.step}; --resume goes on from there", flush=True)
+            sys.exit(128 + signals[0] if signals else 1)
+        sums = dict(progress.sums or {})
+        count = max(1.0, sums.pop("batches", 0.0))
+        losses = {name: total / count for name, total in sums.items()}
+        progress = progress._replace(sums=None)
+        say(f"epoch {epoch + 1:3d}  " + "  ".join(f"{name} {value:.6f}" for name, value in losses.items()), flush=True)
+        record: dict[str, Any] = {"epoch": epoch + 1, "step": progress.step, **losses}
         last = epoch + 1 == config.train.epochs
         if last or (epoch + 1) % config.train.validate_every == 0:
             scores = validate(model, root, val_ids, out / "pictures", said)
-            print(format_table(scores), flush=True)
+            say(format_table(scores), flush=True)
             record["validation"] = {
                 name: {measure: table[measure] for measure in ("R40", "exact")} for name, table in scores.items()
             }
-        for name, value in flatten(record):
-            board.add_scalar(name, value, epoch + 1)
-        board.flush()
-        with metrics.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(record) + "\n")
-        save_run(out, model, optimizer, frames, epoch + 1, step)
-    board.close()
-    print(f"checkpoint: {out / 'checkpoint.pt'}\npictures:   {out / 'pictures'}")
+        if board:
+            for name, value in flatten(record):
+                board.add_scalar(name, value, epoch + 1)
+            board.flush()
+            with (out / "metrics.jsonl").open("a", encoding="utf-8") as file:
+                file.write(json.dumps(record) + "\n")
+            save_run(checkpoint, model, optimizer, frames, progress)
+    if board:
+        board.close()
+    say(f"checkpoint: {checkpoint}\npictures:   {out / 'pictures'}")
+
+
+@contextlib.contextmanager
+def caught_signals() -> Iterator[list[int]]:
+    """Inside, SIGTERM and SIGINT do not end the process: they are added to the list, and the loop looks there.
+
+    A second signal ends it at once.
+    """
+    signals: list[int] = []
+
+    def note(number: int, _: Any) -> None:
+        if signals:
+            sys.exit(128 + number)
+        signals.append(number)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield signals
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def check_room(out: Path, model: HVNet) -> None:
+    """Raises InputError if the disk has no room for a run: two checkpoints with weights and both moments of Adam."""
+    folder = next(path for path in (out, *out.absolute().parents) if path.exists())
+    free = shutil.disk_usage(folder).free
+    wanted = 2 * 3 * sum(weight.numel() * weight.element_size() for weight in model.parameters()) + ROOM
+    if free < wanted:
+        raise InputError(
+            f"{folder}: {free / 1e6:.0f} MB free, the run wants {wanted / 1e6:.0f} MB; free some, or give another --out"
+        )
+
+
+def check_frames(root: Path, names: list[str], skip: bool, say: Callable[..., None]) -> list[str]:
+    """The frames whose small files can be read; the first that cannot ends the run, or is named and skipped."""
+    good = []
+    hidden = ranks.rank() > 0
+    for name in tqdm(names, desc="checking", unit="frame", leave=False, dynamic_ncols=True, disable=hidden):
+        try:
+            check_frame(root, name)
+            good.append(name)
+        except (InputError, OSError) as error:
+            if not skip:
+                raise
+            say(f"frame {name} is skipped: {error}")
+    if not good:
+        raise InputError(f"{root}: no frame of the split can be read")
+    return good
 
 
 def check_frame(root: Path, name: str) -> None:
@@ -298,22 +478,21 @@ def make_deterministic(seed: int) -> None:
     torch.backends.cudnn.benchmark = False
 
 
-def save_run(out: Path, model: HVNet, optimizer: torch.optim.Optimizer, frames: str, epochs: int, steps: int) -> None:
-    """Writes checkpoint.pt: all that a run needs to go on after so many epochs and steps."""
+def save_run(path: Path, model: HVNet, optimizer: torch.optim.Optimizer, frames: str, progress: Progress) -> None:
+    """Writes a checkpoint: all that a run needs to go on."""
     content = {
         "config": config_to_dict(model.config),
         "model": model.state_dict(),
         "optimizer": optimizer.state_dict(),
         "frames": frames,
-        "epoch": epochs,
-        "step": steps,
         "random": torch.get_rng_state(),
+        **progress._asdict(),
     }
-    save_checkpoint(out / "checkpoint.pt", content)
+    save_checkpoint(path, content)
 
 
-def restore(path: Path, model: HVNet, optimizer: torch.optim.Optimizer, frames: str) -> tuple[int, int]:
-    """Takes up a run where its checkpoint left it; returns the epochs and steps done."""
+def restore(path: Path, model: HVNet, optimizer: torch.optim.Optimizer, frames: str) -> Progress:
+    """Takes up a run where its checkpoint left it."""
     content = load_checkpoint(path)
     here = config_to_dict(model.config)
     changed = sorted(key for key, _ in set(_leaves(content["config"])) ^ set(_leaves(here)))
@@ -326,7 +505,7 @@ def restore(path: Path, model: HVNet, optimizer: torch.optim.Optimizer, frames: 
         model.load_state_dict(content["model"])
         optimizer.load_state_dict(content["optimizer"])
         torch.set_rng_state(content["random"])
-        return int(content["epoch"]), int(content["step"])
+        return Progress(*(content[key] for key in Progress._fields))
     except (KeyError, RuntimeError, ValueError, TypeError) as error:
         raise InputError(f"{path}: does not hold a whole run ({error}); start anew with another --out") from error
 
@@ -352,12 +531,11 @@ def flatten(record: Any, key: str = "") -> Iterator[tuple[str, float]]:
         yield key, float(record)
 
 
-def keep_metrics(path: Path, epochs: int) -> Path:
+def keep_metrics(path: Path, epochs: int) -> None:
     """Leaves a line for each epoch that is done: a run may have stopped in or after a line, before its checkpoint."""
     if path.is_file():
         lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
         path.write_text("".join(lines[:epochs]), encoding="utf-8")
-    return path
 
 
 def choose_out(given: str | None, config: Path, resume: bool) -> Path:
@@ -383,7 +561,8 @@ def main(arguments: Sequence[str] | None) -> None:
         " and pictures/ to the run's folder.",
         epilog="examples:\n  python -m hvnet.train\n"
         "  python -m hvnet.train --config configs/compact.yaml --data /data/kitti --set train.batch_size=2\n"
-        "  python -m hvnet.train --out runs/demo --resume",
+        "  python -m hvnet.train --out runs/demo --resume\n"
+        "  torchrun --nproc-per-node 8 -m hvnet.train --config configs/hvnet.yaml --data /data/kitti",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--config", type=Path, default=DEMO, metavar="FILE", help="YAML (default: configs/demo.yaml)")
@@ -405,22 +584,23 @@ def main(arguments: Sequence[str] | None) -> None:
         if entry.name not in CLASSES:
             where = f"{options.config}: head.classes[{k}].name"
             raise InputError(f"{where}: unknown class '{entry.name}'; known are {', '.join(CLASSES)}")
-    device = select_device(options.device)
-    out = choose_out(options.out, options.config, options.resume)
+    device = ranks.start(select_device(options.device))
+    out = ranks.of_first(choose_out(options.out, options.config, options.resume) if ranks.rank() == 0 else None)
     root = options.data
     if root is None:
         if config.synthetic is None:
             raise InputError(f"{options.config}: has no key synthetic, so it needs --data with a KITTI root")
         scenes, reach = config.synthetic, config.encoder.point_range[3]
         root = out.parent / f"scenes-{scenes.train_frames}-{scenes.val_frames}-{reach:g}m-{config.train.seed}"
-        generate(
-            root,
-            scenes.train_frames,
-            scenes.val_frames,
-            config.train.seed,
-            Options(distance=(4.0, min(reach - 2, 80.0))),
-        )
-    train(config, root, out, device, options.resume)
+        if ranks.rank() == 0:
+            distance = (4.0, min(reach - 2, 80.0))
+            generate(root, scenes.train_frames, scenes.val_frames, config.train.seed, Options(distance=distance))
+        ranks.of_first(None)  # the others wait for the scenes
+    try:
+        with caught_signals() as signals:
+            train(config, root, out, device, options.resume, signals)
+    finally:
+        ranks.stop()
 
 
 if __name__ == "__main__":

@@ -12,8 +12,10 @@ from torch import Generator, Tensor
 from hvnet.boxes import bev_corners, boxes_collide, points_in_boxes
 from hvnet.config import AugmentConfig
 from hvnet.data.augment import (
+    Objects,
     augment,
     mix_sectors,
+    objects_of,
     random_flip,
     random_rotation,
     random_scaling,
@@ -21,7 +23,7 @@ from hvnet.data.augment import (
     sample_frame,
     sample_objects,
 )
-from hvnet.data.database import Database, object_points, read_database
+from hvnet.data.database import Database, read_database
 from hvnet.data.kitti import read_frame
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
@@ -43,14 +45,14 @@ def scene(seed: int = 0) -> tuple[Tensor, Tensor]:
     return points, boxes
 
 
-def make_database(objects: list[tuple[str, list[float]]], points_each: int = 10, **columns: list) -> Database:
+def make_objects(objects: list[tuple[str, list[float]]], points_each: int = 10, **columns: list) -> Objects:
     """A database of objects (class, box) with `points_each` points along their middles."""
     count = len(objects)
     box = np.array([box for _, box in objects], dtype=np.float32).reshape(-1, 7)
     xyz_mm = np.zeros((3, count * points_each), dtype=np.int16)
     xyz_mm[0] = np.tile(np.arange(points_each), count)
     arrays = {"truncation": [0.0] * count, "occlusion": [0] * count, "bbox_height": [40.0] * count} | columns
-    return Database(
+    database = Database(
         xyz_mm=xyz_mm,
         reflectance=np.full(count * points_each, 50, dtype=np.uint8),
         offsets=np.arange(count + 1) * points_each,
@@ -63,6 +65,11 @@ def make_database(objects: list[tuple[str, list[float]]], points_each: int = 10,
         occlusion=np.array(arrays["occlusion"], dtype=np.int8),
         bbox_height=np.array(arrays["bbox_height"], dtype=np.float32),
     )
+    return objects_of(database, torch.device("cpu"))
+
+
+def points_of(objects: Objects, k: int) -> Tensor:
+    return objects.points[objects.database.offsets[k] : objects.database.offsets[k + 1]]
 
 
 def car(x: float, y: float, yaw: float = 0.0) -> list[float]:
@@ -160,7 +167,7 @@ def test_points_stay_in_their_boxes(seed: int) -> None:
 def test_augment_repeats_with_its_seed() -> None:
     points, boxes = scene()
     labels = torch.zeros(len(boxes), dtype=torch.int64)
-    database = make_database([("Car", car(x, 60.0)) for x in range(0, 60, 6)])
+    database = make_objects([("Car", car(x, 60.0)) for x in range(0, 60, 6)])
     options = AugmentConfig(objects={"Car": 15})
     first, again, other = (
         augment(points, boxes, labels, database, options, seeded(seed), CLASSES) for seed in (7, 7, 8)
@@ -177,7 +184,7 @@ def test_augment_of_nothing() -> None:
 
 
 def test_sampling_tops_up_to_the_count() -> None:
-    database = make_database([("Car", car(10.0 * k, 50)) for k in range(10)])
+    database = make_objects([("Car", car(10.0 * k, 50)) for k in range(10)])
     boxes = torch.tensor([car(0, 0), car(10, 0), car(20, 0)])
     labels = torch.tensor([0, 0, -1])  # the third is no Car
     points, boxes, labels = sample_objects(torch.zeros(0, 4), boxes, labels, database, {"Car": 5}, seeded(), CLASSES)
@@ -190,34 +197,34 @@ def test_sampling_tops_up_to_the_count() -> None:
 
 
 def test_sampling_takes_what_there_is() -> None:
-    database = make_database([("Car", car(10, 0))])
+    database = make_objects([("Car", car(10, 0))])
     _, boxes, labels = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(), CLASSES)
     assert boxes.tolist() == [car(10, 0)]
     assert labels.tolist() == [0]
 
 
 def test_inserted_object_keeps_its_pose_and_points() -> None:
-    database = make_database([("Pedestrian", [10, 5, -0.5, 0.8, 0.6, 1.8, 0.7])])
+    database = make_objects([("Pedestrian", [10, 5, -0.5, 0.8, 0.6, 1.8, 0.7])])
     cloud = torch.tensor([[10.0, 5, -0.5, 0.1], [30, 5, -0.5, 0.1], [10, 5, 3, 0.1]])
     points, boxes, labels = sample_objects(cloud, *no_boxes(), database, COUNTS, seeded(), CLASSES)
     # the point of the frame inside the box gives way to the object's
-    assert torch.equal(points, torch.cat((cloud[1:], object_points(database, 0))))
-    assert torch.equal(boxes, torch.from_numpy(database.box))
+    assert torch.equal(points, torch.cat((cloud[1:], points_of(database, 0))))
+    assert torch.equal(boxes, torch.from_numpy(database.database.box))
     assert labels.tolist() == [1]
 
 
 def test_sampled_object_that_collides_is_given_up() -> None:
-    database = make_database([("Car", car(10, 0)), ("Car", car(30, 0))])
+    database = make_objects([("Car", car(10, 0)), ("Car", car(30, 0))])
     van = torch.tensor([car(12, 1, 0.5)])
     cloud = torch.tensor([[10.0, 0, -1, 0.1]])
     points, boxes, labels = sample_objects(cloud, van, torch.tensor([-1]), database, COUNTS, seeded(), CLASSES)
     assert boxes.tolist() == [van[0].tolist(), car(30, 0)]
     assert labels.tolist() == [-1, 0]
-    assert torch.equal(points, torch.cat((cloud, object_points(database, 1))))
+    assert torch.equal(points, torch.cat((cloud, points_of(database, 1))))
 
 
 def test_of_two_sampled_objects_that_collide_one_is_inserted() -> None:
-    database = make_database([("Car", car(10, 0)), ("Cyclist", car(11, 0)), ("Car", car(10, 1))])
+    database = make_objects([("Car", car(10, 0)), ("Cyclist", car(11, 0)), ("Car", car(10, 1))])
     for seed in range(10):
         _, boxes, labels = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(seed), CLASSES)
         assert labels.tolist() == [0]
@@ -231,11 +238,11 @@ def test_objects_that_are_hardly_seen_are_not_inserted() -> None:
         "occlusion": [3, 0, 0, 2],
         "bbox_height": [40, 40, 25, 25.5],
     }
-    database = make_database(objects, **columns)
+    database = make_objects(objects, **columns)
     _, boxes, _ = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(), CLASSES)
     assert boxes.tolist() == [car(30, 0)]
     for points_each, inserted in ((4, 0), (5, 4)):
-        database = make_database(objects, points_each)
+        database = make_objects(objects, points_each)
         _, boxes, _ = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(), CLASSES)
         assert len(boxes) == inserted
 
@@ -243,15 +250,15 @@ def test_objects_that_are_hardly_seen_are_not_inserted() -> None:
 def test_no_objects_asked_for() -> None:
     points, boxes = scene()
     labels = torch.zeros(len(boxes), dtype=torch.int64)
-    database = make_database([("Car", car(100, 0))])
+    database = make_objects([("Car", car(100, 0))])
     sampled = sample_objects(points, boxes, labels, database, {}, seeded(), CLASSES)
     assert all(a is b for a, b in zip(sampled, (points, boxes, labels), strict=True))
 
 
 def test_a_whole_frame_keeps_together() -> None:
     objects = [("Car", car(10.0 * k, 0)) for k in range(4)] + [("Van", car(50, 0)), ("Pedestrian", car(60, 0))]
-    database = make_database(objects)
-    database.frame[:] = [3, 7, 7, 3, 7, 7]
+    database = make_objects(objects)
+    database.database.frame[:] = [3, 7, 7, 3, 7, 7]
     found = set()
     for seed in range(10):
         points, boxes, labels = sample_frame(torch.zeros(0, 4), *no_boxes(), database, seeded(seed), CLASSES)
@@ -296,7 +303,7 @@ def test_mixing_with_an_empty_frame_leaves_a_side() -> None:
 
 
 def test_real_frame_with_the_real_database(kitti_root: Path) -> None:
-    database = read_database(kitti_root / "gt_database.npz")
+    database = objects_of(read_database(kitti_root / "gt_database.npz"), torch.device("cpu"))
     frame = read_frame(kitti_root, "000008")
     labels = torch.tensor([CLASSES.index(name) if name in CLASSES else -1 for name in frame.names])
     points, boxes, classes = sample_objects(frame.points, frame.boxes, labels, database, COUNTS, seeded(), CLASSES)
@@ -314,6 +321,7 @@ def test_real_frame_with_the_real_database(kitti_root: Path) -> None:
     assert not points_in_boxes(points[:begun], inserted).any()
     assert points_in_boxes(points, inserted).any(0).all()
     assert len(points) - begun == sum(
-        len(object_points(database, int(np.flatnonzero((database.box == box.numpy()).all(1))[0]))) for box in inserted
+        len(points_of(database, int(np.flatnonzero((database.database.box == box.numpy()).all(1))[0])))
+        for box in inserted
     )
     assert torch.isfinite(bev_corners(boxes)).all()

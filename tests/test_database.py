@@ -87,9 +87,9 @@ def test_build_database(root: Path) -> None:
 
 def test_object_points(root: Path) -> None:
     database = build_database(root, "train")
-    points = object_points(database, 2)
+    points = object_points(database)
     assert points.dtype == torch.float32
-    assert torch.equal(points, torch.from_numpy(POINTS[[0, 2]]))
+    assert torch.equal(points[database.offsets[2] : database.offsets[3]], torch.from_numpy(POINTS[[0, 2]]))
 
 
 def test_write_and_read(root: Path) -> None:
@@ -117,8 +117,10 @@ def test_real_database_is_reproduced(kitti_root: Path) -> None:
             np.testing.assert_allclose(built.box, real.box[rows], atol=5e-7)
         elif name not in ("xyz_mm", "reflectance", "offsets"):
             np.testing.assert_array_equal(getattr(built, name), getattr(real, name)[rows], err_msg=name)
+    points, real_points = object_points(built), object_points(real)
     for k, row in enumerate(rows):
-        assert torch.equal(object_points(built, k), object_points(real, int(row)))
+        mine = points[built.offsets[k] : built.offsets[k + 1]]
+        assert torch.equal(mine, real_points[real.offsets[row] : real.offsets[row + 1]])
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,14 @@ import io
 import json
 import math
 import re
+import resource
 import shutil
+import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,10 +25,12 @@ from torch.utils.data import DataLoader
 
 from hvnet.cli import InputError
 from hvnet.config import Config, TrainConfig, load_config
+from hvnet.data.augment import objects_of
 from hvnet.data.database import build_database, object_points, write_database
+from hvnet.data.kitti import read_split
 from hvnet.detector import load
 from hvnet.evaluate import CLASSES
-from hvnet.model import load_checkpoint, save_checkpoint
+from hvnet.model import HVNet, load_checkpoint, save_checkpoint
 from hvnet.train import (
     EpochOrder,
     TrainingFrames,
@@ -36,6 +43,7 @@ from hvnet.train import (
     seeded,
 )
 
+CPU = torch.device("cpu")
 DEMO = Path(__file__).resolve().parents[1] / "configs" / "demo.yaml"
 TINY = [
     "encoder.point_range=[0, -6.4, -3, 25.6, 6.4, 2]",
@@ -267,12 +275,145 @@ def test_a_broken_checkpoint_is_refused(scenes: Path, begun: Path) -> None:
 
 def test_metrics_keep_the_epochs_that_are_done(tmp_path: Path) -> None:
     path = tmp_path / "metrics.jsonl"
-    assert keep_metrics(path, 0) == path
+    keep_metrics(path, 0)
     assert not path.exists()
     for rest in ("", '{"epoch": 3}\n', '{"epoch": 3, "a": {"b": 1}', "{"):
         path.write_text('{"epoch": 1}\n{"epoch": 2}\n' + rest)
         keep_metrics(path, 2)
         assert path.read_text() == '{"epoch": 1}\n{"epoch": 2}\n'
+
+
+# --- runs that are stopped --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_a_run_after_its_step(
+    scenes: Path, trained: tuple[Path, str], tmp_path: Path, steps: int, number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rate = learning_rate
+
+    def signalled(config: TrainConfig, step: int, *rest: int) -> float:
+        if step + 1 == steps:
+            signal.raise_signal(number)
+        return rate(config, step, *rest)
+
+    out = tmp_path / "out"
+    with monkeypatch.context() as patched:
+        patched.setattr("hvnet.train.learning_rate", signalled)
+        with pytest.raises(SystemExit) as ended:
+            run(scenes, out)
+    assert ended.value.code == 128 + number
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    content = load_checkpoint(out / "checkpoint.pt")
+    assert (content["epoch"], content["batch"], content["step"]) == (steps // 2, 1, steps)
+    run(scenes, out, resume=True)
+    assert same(load_checkpoint(out / "checkpoint.pt"), load_checkpoint(trained[0] / "checkpoint.pt"))
+    assert metrics(out) == metrics(trained[0])
+
+
+KILLED = """
+import os, signal, sys, torch
+import hvnet.train as train, hvnet.model as model
+torch.set_num_threads(1)
+place, count = sys.argv[1], int(sys.argv[2])
+calls = []
+def killed(*_):
+    calls.append(None)
+    if len(calls) == count:
+        os.kill(os.getpid(), signal.SIGKILL)
+if place == "step":
+    train.say_once = killed
+else:
+    save = torch.save
+    def half(content, file):
+        save(content, file)
+        file.seek(file.tell() // 2)
+        file.truncate()
+        file.flush()
+        killed()
+        file.seek(0)
+        save(content, file)
+    torch.save = half
+train.main(sys.argv[3:])
+"""
+
+
+# the place, the call of it that is killed (of notes: two in the steps of an epoch, two in its validation), epochs saved
+PLACES = [("step", 2, 0), ("step", 4, 0), ("step", 6, 1), ("save", 2, 0), ("save", 3, 1)]
+
+
+@pytest.mark.parametrize(("place", "count", "epochs"), PLACES)
+def test_a_killed_run_goes_on(
+    scenes: Path, trained: tuple[Path, str], tmp_path: Path, place: str, count: int, epochs: int
+) -> None:
+    """kill -9 in a step, and in the middle of a checkpoint: the resumed run ends with the same bits."""
+    out = tmp_path / "out"
+    arguments = ["--config", str(DEMO), "--out", str(out), "--device", "cpu", "--data", str(scenes)]
+    arguments += [part for change in TINY for part in ("--set", change)]
+    command = [sys.executable, "-c", KILLED, place, str(count), *arguments]
+    done = subprocess.run(command, cwd=DEMO.parents[1], capture_output=True, text=True, check=False)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert (out / "checkpoint.partial").exists() == (place == "save")
+    assert load_checkpoint(out / "checkpoint.pt")["epoch"] == epochs
+    run(scenes, out, resume=True)
+    assert same(load_checkpoint(out / "checkpoint.pt"), load_checkpoint(trained[0] / "checkpoint.pt"))
+    assert metrics(out) == metrics(trained[0])
+    assert not (out / "checkpoint.partial").exists()
+
+
+def test_a_full_disk_leaves_the_last_checkpoint(scenes: Path, begun: Path, trained: tuple[Path, str]) -> None:
+    """The system refuses to write past 50 kB, as it refuses on a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = (begun / "checkpoint.pt").read_bytes()
+    assert len(before) > 50_000
+    content = load_checkpoint(begun / "checkpoint.pt")
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limits[1]))
+    try:
+        with pytest.raises(InputError, match=r"checkpoint\.pt: cannot be written .*held before is whole"):
+            save_checkpoint(begun / "checkpoint.pt", content)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert (begun / "checkpoint.pt").read_bytes() == before
+    assert not (begun / "checkpoint.partial").exists()
+
+
+def test_a_disk_without_room_is_found_before_the_run(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=10**6))
+    with pytest.raises(InputError, match=r"1 MB free, the run wants \d+ MB; free some, or give another --out"):
+        run(scenes, tmp_path / "new" / "out")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("place", ["label", "points", "points that change during the run"])
+def test_a_corrupt_frame_is_named_and_skipped(
+    copied: Path, tmp_path: Path, place: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = read_split(copied, "train")
+    bad = copied / "training" / ("label_2" if place == "label" else "velodyne") / names[1]
+    if place == "label":
+        bad.with_suffix(".txt").write_text("Car 1 2 three\n")
+    else:
+        bad.with_suffix(".bin").write_bytes(b"x" * 17)
+    if place.endswith("run"):
+        monkeypatch.setattr("hvnet.train.check_frame", lambda *_: None)
+    with pytest.raises(InputError, match=names[1]):
+        run(copied, tmp_path / "stopped")
+    noted: list[str] = []
+    monkeypatch.setattr("hvnet.train.tqdm.write", noted.append)
+    printed = run(copied, tmp_path / "out", "train.skip_corrupt=true", "augment.objects={}")
+    said = printed + "\n".join(noted)
+    assert said.count(f"frame {names[1]} is skipped: ") == 1
+    assert len(metrics(tmp_path / "out")) == 2
+
+
+def test_no_frame_can_be_read(copied: Path, tmp_path: Path) -> None:
+    for file in (copied / "training" / "label_2").iterdir():
+        file.write_text("Car 1 2 three\n")
+    with pytest.raises(InputError, match="no frame of the split can be read"):
+        run(copied, tmp_path / "out", "train.skip_corrupt=true", "augment.objects={}")
 
 
 # --- mistakes ---------------------------------------------------------------------------------------------------------
@@ -353,14 +494,39 @@ def _entry(name: str) -> str:
     )
 
 
-def test_a_diverging_run_keeps_its_last_checkpoint(scenes: Path, begun: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_diverging_run_keeps_its_last_checkpoint(scenes: Path, begun: Path) -> None:
     before = contents(begun)
-    with pytest.raises(InputError, match=r"the loss is .* at step \d+; lower train\.learning_rate and --resume"):
+    message = r"the loss is .* at step \d+; its frames are in .*non_finite\.jsonl; lower train\.learning_rate.*--resume"
+    with pytest.raises(InputError, match=message):
         run(scenes, begun, "train.learning_rate=1.0e+30", "train.epochs=9", resume=True)
     assert load_checkpoint(begun / "checkpoint.pt")["epoch"] >= 2
     for value in load_checkpoint(begun / "checkpoint.pt")["model"].values():
         assert value.isfinite().all()
     assert contents(begun).keys() >= before.keys()
+    line = json.loads((begun / "non_finite.jsonl").read_text())
+    assert len(line["frames"]) == 2
+    assert set(line["frames"]) < {"000000", "000001", "000002", "000003"}
+
+
+def test_a_step_that_is_not_finite_is_left_out(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    plain = HVNet.loss
+
+    def broken(self: HVNet, *arguments: Any) -> dict[str, torch.Tensor]:
+        terms = plain(self, *arguments)
+        calls.append(len(calls))
+        return {name: term * math.nan for name, term in terms.items()} if calls[-1] == 1 else terms
+
+    monkeypatch.setattr(HVNet, "loss", broken)
+    out = tmp_path / "out"
+    run(scenes, out, "train.skip_non_finite=true")
+    assert len(calls) == 4
+    (line,) = (json.loads(line) for line in (out / "non_finite.jsonl").read_text().splitlines())
+    assert (line["epoch"], line["step"], line["loss"]) == (1, 1, "nan")
+    content = load_checkpoint(out / "checkpoint.pt")
+    assert all(value.isfinite().all() for value in content["model"].values())
+    assert all(math.isfinite(record["loss"]) for record in metrics(out))
+    assert {int(state["step"]) for state in content["optimizer"]["state"].values()} == {3}
 
 
 # --- odd frames -------------------------------------------------------------------------------------------------------
@@ -431,8 +597,10 @@ def test_objects_of_validation_frames_are_left_out(copied: Path, tiny: Config, c
     assert 0 < dropped < len(every)
     assert f"{dropped} objects of validation frames are left out" in capsys.readouterr().out
     kept = np.flatnonzero(~np.isin(every.frame, [1, 3]))
+    points, of_every = object_points(database), object_points(every)
     for k, of_all in enumerate(kept):
-        assert torch.equal(object_points(database, k), object_points(every, of_all))
+        begin, end = every.offsets[of_all : of_all + 2]
+        assert torch.equal(points[database.offsets[k] : database.offsets[k + 1]], of_every[begin:end])
 
 
 def test_learning_rate() -> None:
@@ -449,12 +617,11 @@ def test_learning_rate() -> None:
 
 def test_an_item_depends_on_seed_epoch_and_number_alone(scenes: Path, tiny: Config) -> None:
     ids = ["000000", "000001", "000002"]
-    database = load_database(scenes, tiny, [])
+    objects = objects_of(load_database(scenes, tiny, []), CPU)
 
     def frames(seed: int = 0) -> TrainingFrames:
-        return TrainingFrames(
-            scenes, ids, dataclasses.replace(tiny, train=dataclasses.replace(tiny.train, seed=seed)), database
-        )
+        config = dataclasses.replace(tiny, train=dataclasses.replace(tiny.train, seed=seed))
+        return TrainingFrames(scenes, ids, config, objects, CPU)
 
     one = frames()
     first = {item: one[item] for item in ((0, 0), (0, 1), (1, 0), (7, 2))}
@@ -468,15 +635,33 @@ def test_an_item_depends_on_seed_epoch_and_number_alone(scenes: Path, tiny: Conf
 
 
 def test_order_of_an_epoch() -> None:
-    order = EpochOrder(50, seed=3)
+    order = EpochOrder(50, 4, seed=3)
     first = list(order)
-    assert len(order) == 50
-    assert sorted(first) == [(0, k) for k in range(50)]
+    assert len(order) == len(first) == 12  # two frames do not fill a batch
+    items = [item for batch in first for item in batch]
+    assert all(len(batch) == 4 for batch in first)
+    assert len(set(items)) == 48
+    assert set(items) < {(0, k) for k in range(50)}
     assert list(order) == first
-    order.epoch = 1
-    assert sorted(order) == [(1, k) for k in range(50)]
-    assert [k for _, k in order] != [k for _, k in first]
-    assert list(EpochOrder(50, seed=4)) != first
+    order.begin = 5
+    assert list(order) == first[5:]
+    order.begin, order.epoch = 0, 1
+    assert {epoch for batch in order for epoch, _ in batch} == {1}
+    assert [k for batch in order for _, k in batch] != [k for _, k in items]
+    assert list(EpochOrder(50, 4, seed=4)) != first
+    assert [len(batch) for batch in EpochOrder(3, 4, seed=0)] == [3]  # unless there are no others
+
+
+def test_ranks_share_a_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = list(EpochOrder(8, 4, seed=0))
+    monkeypatch.setattr("hvnet.ranks.size", lambda: 2)
+    shares = []
+    for rank in range(2):
+        monkeypatch.setattr("hvnet.ranks.rank", lambda rank=rank: rank)
+        shares.append(list(EpochOrder(8, 4, seed=0)))
+    for batch, *parts in zip(whole, *shares, strict=True):
+        assert [len(part) for part in parts] == [2, 2]
+        assert sorted(parts[0] + parts[1]) == sorted(batch)
 
 
 def test_seeds_are_mixed() -> None:
@@ -497,7 +682,8 @@ def test_boxes_outside_the_range_and_other_classes_are_dropped(copied: Path, tin
         "DontCare -1 -1 -10 600 150 700 200 -1 -1 -1 -1000 -1000 -1000 -10",
     ]
     (copied / "training" / "label_2" / "000000.txt").write_text("\n".join(lines) + "\n")
-    _, boxes, labels, _ = TrainingFrames(copied, ["000000"], config, None)[0, 0]
+    _, boxes, labels, _, name = TrainingFrames(copied, ["000000"], config, None, CPU)[0, 0]
+    assert name == "000000"
     assert labels.tolist() == [0, 2]
     # the camera stands 0.27 m before the LiDAR, and its axes are turned by less than a degree
     torch.testing.assert_close(boxes[:, :2], torch.tensor([[10.3, 0.0], [9.3, -5.0]]), rtol=0, atol=0.2)
@@ -506,10 +692,11 @@ def test_boxes_outside_the_range_and_other_classes_are_dropped(copied: Path, tin
 def test_batches_hold_whole_frames(scenes: Path, tiny: Config) -> None:
     items = [(0, 2), (0, 0), (0, 1)]
     config = dataclasses.replace(tiny, augment=dataclasses.replace(tiny.augment, objects={}))
-    frames = TrainingFrames(scenes, ["000000", "000001", "000002"], config, None)
+    frames = TrainingFrames(scenes, ["000000", "000001", "000002"], config, None, CPU)
     (batch,) = DataLoader(frames, batch_size=3, sampler=items, collate_fn=collate)  # type: ignore[arg-type]
     for b, item in enumerate(items):
-        points, boxes, labels, _ = frames[item]
+        points, boxes, labels, _, name = frames[item]
+        assert batch.names[b] == name
         assert torch.equal(batch.points[batch.sample == b], points)
         assert torch.equal(batch.boxes[b], boxes)
         assert torch.equal(batch.labels[b], labels)

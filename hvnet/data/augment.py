@@ -6,6 +6,7 @@ generator that is passed in: one that is seeded by (seed, epoch, index) makes a 
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,25 +20,39 @@ MIN_POINTS = 5
 """Objects of fewer points are not inserted, as in SECOND."""
 
 
+class Objects(NamedTuple):
+    """A ground-truth database that is ready for use."""
+
+    database: Database
+    points: Tensor  # (M, 4) of all objects, on the device of the frames
+
+
+def objects_of(database: Database, device: torch.device) -> Objects:
+    """The database with its points on a device."""
+    return Objects(database, object_points(database).to(device))
+
+
 def augment(
     points: Tensor,
     boxes: Tensor,
     labels: Tensor,
-    database: Database | None,
+    objects: Objects | None,
     options: AugmentConfig,
     generator: Generator,
     classes: Sequence[str],
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Augments one frame: points (N, 4), boxes (M, 7) and labels (M,), which number the boxes' classes in `classes`.
 
+    The points may lie on a GPU; boxes and labels stay on the host, where what is drawn depends on them.
+
     Objects are inserted first, as in SECOND, which the paper follows, though it names the global changes first: objects
     keep the pose in which the scanner saw them, which is in the camera's view only before the frame is turned.
     """
-    if database is not None:
+    if objects is not None:
         if options.whole_frames and torch.rand((), generator=generator).item() < options.whole_frames:
-            points, boxes, labels = sample_frame(points, boxes, labels, database, generator, classes)
+            points, boxes, labels = sample_frame(points, boxes, labels, objects, generator, classes)
         else:
-            points, boxes, labels = sample_objects(points, boxes, labels, database, options.objects, generator, classes)
+            points, boxes, labels = sample_objects(points, boxes, labels, objects, options.objects, generator, classes)
     points, boxes = random_flip(points, boxes, options.flip, generator)
     points, boxes = random_rotation(points, boxes, options.rotation, generator)
     points, boxes = random_scaling(points, boxes, options.scaling, generator)
@@ -86,7 +101,7 @@ def random_translation(
     """Moves all by a normal distribution of mean 0 and the given standard deviations along x, y and z, metres."""
     shift = torch.randn(3, generator=generator) * torch.tensor(deviation)
     points, boxes = points.clone(), boxes.clone()
-    points[:, :3] += shift
+    points[:, :3] += shift.to(points.device)
     boxes[:, :3] += shift
     return points, boxes
 
@@ -109,14 +124,17 @@ def mix_sectors(
     kept_boxes, other_boxes = left(boxes) != left_from_other, left(others[1]) == left_from_other
     own, own_labels = boxes[kept_boxes], labels[kept_boxes]
     new, new_labels = others[1][other_boxes], others[2][other_boxes]
-    in_own, in_new = points_in_boxes(points, own).any(dim=1), points_in_boxes(points, new).any(dim=1)
-    from_own, from_new = points_in_boxes(others[0], own).any(dim=1), points_in_boxes(others[0], new).any(dim=1)
+
+    def within(cloud: Tensor, among: Tensor) -> Tensor:
+        return points_in_boxes(cloud, among.to(cloud.device)).any(dim=1)
+
+    in_own, in_new = within(points, own), within(points, new)
+    from_own, from_new = within(others[0], own), within(others[0], new)
     stays = (in_own | (left(points) != left_from_other)) & ~(in_new & ~in_own)
     comes = (from_new | (left(others[0]) == left_from_other)) & ~(from_own & ~from_new)
     # an object cut away on the other side must not stay behind as half of one
-    cut, cut_other = points_in_boxes(points, boxes[~kept_boxes]), points_in_boxes(others[0], others[1][~other_boxes])
-    stays &= ~cut.any(dim=1) | in_own
-    comes &= ~cut_other.any(dim=1) | from_new
+    stays &= ~within(points, boxes[~kept_boxes]) | in_own
+    comes &= ~within(others[0], others[1][~other_boxes]) | from_new
     return torch.cat((points[stays], others[0][comes])), torch.cat((own, new)), torch.cat((own_labels, new_labels))
 
 
@@ -124,7 +142,7 @@ def sample_objects(
     points: Tensor,
     boxes: Tensor,
     labels: Tensor,
-    database: Database,
+    objects: Objects,
     counts: Mapping[str, int],
     generator: Generator,
     classes: Sequence[str],
@@ -134,40 +152,42 @@ def sample_objects(
     labels (M,) int64 number the boxes' classes in `classes`; boxes of any other number only block their place. Of each
     class in `counts` so many objects are drawn, without replacement, that the frame has this count of them.
     """
+    database = objects.database
     drawn: list[np.ndarray] = [np.empty(0, np.int64)]
     drawn_labels: list[int] = []
     usable = _usable(database)
     for name, count in counts.items():
         label = classes.index(name)
         missing = max(0, count - int((labels == label).sum()))
-        objects = np.flatnonzero(usable & (database.name == name))
-        picked = torch.randperm(len(objects), generator=generator)[:missing].numpy()
-        drawn.append(objects[picked])
+        known = np.flatnonzero(usable & (database.name == name))
+        picked = torch.randperm(len(known), generator=generator)[:missing].numpy()
+        drawn.append(known[picked])
         drawn_labels += [label] * len(picked)
-    return _insert(points, boxes, labels, database, np.concatenate(drawn), drawn_labels)
+    return _insert(points, boxes, labels, objects, np.concatenate(drawn), drawn_labels)
 
 
 def sample_frame(
-    points: Tensor, boxes: Tensor, labels: Tensor, database: Database, generator: Generator, classes: Sequence[str]
+    points: Tensor, boxes: Tensor, labels: Tensor, objects: Objects, generator: Generator, classes: Sequence[str]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Inserts all objects of one frame of the database, so that they stand together as they did: a queue at a light,
     cars along a kerb. Those of other classes come with them and have label -1."""
+    database = objects.database
     frames = np.unique(database.frame)
     frame = frames[int(torch.randint(len(frames), (), generator=generator))]
     drawn = np.flatnonzero((database.frame == frame) & (np.diff(database.offsets) >= MIN_POINTS))
     drawn_labels = [classes.index(name) if name in classes else -1 for name in database.name[drawn]]
-    return _insert(points, boxes, labels, database, drawn, drawn_labels)
+    return _insert(points, boxes, labels, objects, drawn, drawn_labels)
 
 
 def _insert(
-    points: Tensor, boxes: Tensor, labels: Tensor, database: Database, drawn: np.ndarray, drawn_labels: Sequence[int]
+    points: Tensor, boxes: Tensor, labels: Tensor, objects: Objects, drawn: np.ndarray, drawn_labels: Sequence[int]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Inserts rows of the database, in this order, into a frame.
 
     An object that collides in bird's eye view with a box of the frame or with one inserted before is given up, not
     redrawn. Points of the frame inside an inserted box give way to the object's own.
     """
-    drawn_boxes = torch.from_numpy(database.box[drawn])
+    drawn_boxes = torch.from_numpy(objects.database.box[drawn])
     collides = boxes_collide(drawn_boxes, torch.cat((boxes, drawn_boxes))).numpy()
     standing = np.arange(len(boxes) + len(drawn)) < len(boxes)
     for k in range(len(drawn)):
@@ -176,8 +196,9 @@ def _insert(
     if len(inserted) == 0:
         return points, boxes, labels
     new_boxes = drawn_boxes[inserted]
-    points = points[~points_in_boxes(points, new_boxes).any(dim=1)]
-    points = torch.cat([points, *(object_points(database, k) for k in drawn[inserted])])
+    points = points[~points_in_boxes(points, new_boxes.to(points.device)).any(dim=1)]
+    offsets = objects.database.offsets
+    points = torch.cat([points, *(objects.points[offsets[k] : offsets[k + 1]] for k in drawn[inserted])])
     return points, torch.cat((boxes, new_boxes)), torch.cat((labels, labels.new_tensor(drawn_labels)[inserted]))
 
 

@@ -71,13 +71,17 @@ LAYOUT = {
 }
 
 
-def object_points(database: Database, k: int) -> Tensor:
-    """Points (n, 4) float32 of object k, where it was seen: x, y, z in metres, reflectance in [0, 1]."""
-    begin, end = database.offsets[k], database.offsets[k + 1]
-    points = np.empty((end - begin, 4))
-    points[:, :3] = (database.xyz_mm[:, begin:end].T + database.centre_mm[k]) / 1000
-    points[:, 3] = database.reflectance[begin:end] / 100
-    return torch.from_numpy(points.astype(np.float32))
+def object_points(database: Database) -> Tensor:
+    """Points (M, 4) float32 of all objects, where they were seen: x, y, z in metres, reflectance in [0, 1].
+
+    Object k has the rows offsets[k]:offsets[k + 1].
+    """
+    lengths = np.diff(database.offsets)
+    points = np.empty((len(database.reflectance), 4), np.float32)
+    for axis in range(3):
+        points[:, axis] = (database.xyz_mm[axis] + np.repeat(database.centre_mm[:, axis], lengths)) / 1000
+    points[:, 3] = database.reflectance / 100
+    return torch.from_numpy(points)
 
 
 def build_database(root: Path, split: str) -> Database:
