@@ -198,7 +198,9 @@ def _build(kind: Any, value: Any, key: str, source: str) -> Any:
     """The value as the annotated type, or an InputError with the dotted key."""
 
     def wrong(wanted: str) -> InputError:
-        return InputError(f"{source}: {key}: want {wanted}, got {value!r} ({type(value).__name__})")
+        shown = repr(value)
+        shown = shown if len(shown) < 200 else shown[:200] + "..."
+        return InputError(f"{source}: {key}: want {wanted}, got {shown} ({type(value).__name__})")
 
     if isinstance(kind, type) and dataclasses.is_dataclass(kind):
         if not isinstance(value, dict):

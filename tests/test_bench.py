@@ -104,3 +104,25 @@ def test_shares(monkeypatch: pytest.MonkeyPatch) -> None:
         with pytest.raises(SystemExit, match="no timing"):
             timing["agree"]("sum", [got], [torch.tensor([1.0, 2.0])], 1e-4, 1e-4)
     timing["agree"]("sum", [torch.tensor([1.0, 2.0001])], [torch.tensor([1.0, 2.0])], 1e-4, 0)
+
+
+def test_stages_of_the_detector(tmp_path: Path) -> None:
+    file = tmp_path / "rows.csv"
+    done = bench("detect", "--configs", "demo", "--batch", "1", "2", "--repeat", "2", "--csv", str(file))
+    assert done.returncode == 0, done.stdout + done.stderr
+    with file.open(encoding="utf-8") as table:
+        rows = list(csv.DictReader(table))
+    stages = ["read", "encode", "backbone", "heads", "decode", "NMS", "detector", "plain model"]
+    assert [row["stage"] for row in rows] == 2 * stages
+    assert all(0 < float(row["p50_ms"]) <= float(row["p95_ms"]) for row in rows)
+
+
+def test_stages_of_training(tmp_path: Path) -> None:
+    file = tmp_path / "rows.csv"
+    done = bench("train", "--configs", "demo", "--repeat", "2", "--csv", str(file))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "frames/s" in done.stdout
+    with file.open(encoding="utf-8") as table:
+        rows = {row["stage"]: float(row["p50_ms"]) for row in csv.DictReader(table)}
+    assert list(rows) == ["data", "encoder", "backbone and heads", "loss", "backward", "optimiser", "step"]
+    assert 0.5 < rows.pop("step") / sum(rows.values()) < 1.5

@@ -45,6 +45,8 @@ ALLOWED = {f"kernels.{name}": allowed for name, allowed in KERNELS.items()} | {
     "draw": {"boxes"},
     "matching": ANY_KERNEL | {"boxes", "data.kitti"},
     "evaluate": {"boxes", "matching", "data.kitti"},
+    "weights.__init__": set(),
+    "weights.__main__": {"model", "train"},
     "train": NETWORK | DATA | {"model", "detector", "draw", "evaluate", "ranks"},
     "detect": NETWORK | DATA | {"model", "detector", "draw", "evaluate"},
 }
@@ -53,7 +55,14 @@ ALLOWED = {f"kernels.{name}": allowed for name, allowed in KERNELS.items()} | {
 def modules() -> dict[str, Path]:
     """Every module of the package by its dotted name below hvnet."""
     found = {}
-    for folder, prefix in ((ROOT / "hvnet", ""), (ROOT / "hvnet" / "data", "data."), (ROOT / "kernels", "kernels.")):
+    package = ROOT / "hvnet"
+    folders = (
+        (package, ""),
+        (package / "data", "data."),
+        (package / "weights", "weights."),
+        (ROOT / "kernels", "kernels."),
+    )
+    for folder, prefix in folders:
         for path in folder.glob("*.py"):
             found[prefix + path.stem] = path
     return found

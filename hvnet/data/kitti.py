@@ -210,7 +210,7 @@ def read_labels(path: Path, scored: bool = False) -> Labels:
             for field, text in enumerate(row[1:], 2):
                 if not _is_number(text, whole=field == 3):
                     kind = "whole number" if field == 3 else "finite number"
-                    raise InputError(f"{path}:{number}: field {field} is '{text}', not a {kind}") from None
+                    raise InputError(f"{path}:{number}: field {field} is '{text[:60]}', not a {kind}") from None
         raise
     flat = (labels.dimensions <= 0).any(axis=1) & (labels.name != "DontCare")
     if flat.any() and not scored:  # results may come without 3D boxes
@@ -280,7 +280,7 @@ def read_calibration(path: Path) -> Calibration:
             raise InputError(f"{path}:{number}: {key} has {len(texts)} numbers, expected {rows * columns}")
         for value in texts:
             if not _is_number(value, whole=False):
-                raise InputError(f"{path}:{number}: {key} holds '{value}', not a finite number")
+                raise InputError(f"{path}:{number}: {key} holds '{value[:60]}', not a finite number")
         found[key] = np.array([float(value) for value in texts]).reshape(rows, columns)
         if key != "P2" and abs(np.linalg.det(found[key][:, :3]) - 1) > 0.01:
             raise InputError(f"{path}:{number}: {key} is no rotation: its determinant is not 1")

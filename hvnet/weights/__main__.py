@@ -1,0 +1,65 @@
+"""Makes the weights of the package anew: `python -m hvnet.weights --data KITTI_ROOT`.
+
+It trains configs/compact.yaml by the recipe below and writes the result in half precision. The root is the piece of
+KITTI that docs/model_card.md names: 23 whole frames, and the objects of all 3712 training frames in gt_database.npz.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from hvnet import train
+from hvnet.cli import InputError, run_command
+from hvnet.model import load_checkpoint, save_checkpoint
+
+CONFIG = Path(__file__).resolve().parents[2] / "configs" / "compact.yaml"
+RECIPE = (
+    "train.epochs=40",
+    "train.repeat=20",
+    "train.batch_size=2",
+    "train.learning_rate=3.0e-3",
+    "train.warmup_steps=200",
+    "train.cosine=true",
+    "train.bfloat16=true",
+    "train.validate_every=5",
+    "augment.mix=0.5",
+    "augment.whole_frames=0.2",
+)
+"""What differs from the config; docs/training.md says why."""
+
+
+def halve(checkpoint: Path, out: Path) -> None:
+    """Writes config and weights of a checkpoint, the parameters in half precision.
+
+    Running statistics stay in float32: variances of what comes out of the encoder are beyond float16.
+    """
+    content = load_checkpoint(checkpoint)
+    running = ("running_mean", "running_var", "num_batches_tracked")
+    model = {
+        name: value if name.endswith(running) else value.to(torch.float16) for name, value in content["model"].items()
+    }
+    save_checkpoint(out, {"config": content["config"], "model": model})
+
+
+def main(arguments: Sequence[str] | None) -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(prog="python -m hvnet.weights", description=__doc__)
+    parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="a KITTI root with gt_database.npz")
+    parser.add_argument("--run", type=Path, default=Path("runs/weights"), metavar="DIR", help="(default: runs/weights)")
+    parser.add_argument("--out", type=Path, default=Path("compact.pt"), metavar="FILE", help="(default: compact.pt)")
+    parser.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
+    options = parser.parse_args(arguments)
+    if not CONFIG.is_file():
+        raise InputError(f"{CONFIG}: no such file; run this in a clone of the project, installed with pip install -e .")
+    command = ["--config", str(CONFIG), "--data", str(options.data), "--out", str(options.run)]
+    command += ["--device", options.device, *(["--resume"] if options.resume else [])]
+    train.main(command + [part for change in RECIPE for part in ("--set", change)])
+    halve(options.run / "checkpoint.pt", options.out)
+    print(f"weights:    {options.out} ({options.out.stat().st_size / 1e6:.2f} MB)")
+
+
+if __name__ == "__main__":
+    run_command(main)
