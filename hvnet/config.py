@@ -69,12 +69,13 @@ class HeadConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the total loss (the paper's lambdas; the direction branch has SECOND's 0.2)."""
+    """Weights of the total loss (the paper's lambdas; the direction branch has SECOND's 0.2), and smooth L1's shape."""
 
     localization: float = 1.0
     classification: float = 1.0
     vertical: float = 1.5
     direction: float = 0.2
+    beta: float = 1.0  # error at which smooth L1 turns linear: metres for corners; SECOND's sigma of 3 is 1/9
 
 
 @dataclass(frozen=True)
@@ -306,6 +307,7 @@ def _check(config: Config, source: str) -> None:
         want(getattr(head, key) > 0, f"head.{key}", "1 or more", getattr(head, key))
     for weight in _keys(LossConfig):
         want(getattr(config.loss, weight) >= 0, f"loss.{weight}", "0 or more", getattr(config.loss, weight))
+    want(config.loss.beta > 0, "loss.beta", "above 0", config.loss.beta)
     augment = config.augment
     want(0 <= augment.flip <= 1, "augment.flip", "between 0 and 1", augment.flip)
     want(augment.rotation >= 0, "augment.rotation", "0 or more", augment.rotation)

@@ -1,5 +1,7 @@
 """Losses (Sec. 3.5, Eq. 5): focal, corners, vertical, and the optional direction."""
 
+import functools
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -22,10 +24,11 @@ def class_loss(maps: HeadMaps, targets: Targets, entry: ClassConfig, weights: Lo
     positives = joined(targets.positive.sum()).clamp(min=1)
     focal = focal_loss(maps.logits, targets.positive, targets.negative, entry.focal_alpha, entry.focal_gamma)
     at = targets.positive
+    smooth_l1 = functools.partial(F.smooth_l1_loss, reduction="sum", beta=weights.beta)
     terms = {
         "classification": weights.classification * focal,
-        "localization": weights.localization * F.smooth_l1_loss(maps.corners[at], targets.corners, reduction="sum"),
-        "vertical": weights.vertical * F.smooth_l1_loss(maps.vertical[at], targets.vertical, reduction="sum"),
+        "localization": weights.localization * smooth_l1(maps.corners[at], targets.corners),
+        "vertical": weights.vertical * smooth_l1(maps.vertical[at], targets.vertical),
     }
     if maps.direction is not None:
         direction = F.cross_entropy(maps.direction[at], targets.direction, reduction="sum")

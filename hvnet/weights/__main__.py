@@ -16,14 +16,14 @@ from hvnet.model import load_checkpoint, save_checkpoint
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "compact.yaml"
 RECIPE = (
-    "train.epochs=40",
+    "train.epochs=32",
     "train.repeat=20",
     "train.batch_size=2",
     "train.learning_rate=3.0e-3",
     "train.warmup_steps=200",
     "train.cosine=true",
     "train.bfloat16=true",
-    "train.validate_every=5",
+    "train.validate_every=4",
     "augment.mix=0.5",
     "augment.whole_frames=0.2",
 )
