@@ -31,8 +31,8 @@ STAGES = ("data", "encoder", "backbone and heads", "loss", "backward", "optimise
 
 def time_steps(config: Config, root: Path, device: torch.device, repeat: int) -> dict[str, list[float]]:
     """Seconds of every stage and of the whole step, `repeat` times."""
-    database = load_database(root, config, [])
     ids = read_split(root, config.train.train_split)
+    database = load_database(root, ids, [])
     frames = TrainingFrames(root, ids, config, objects_of(database, device), device)
     torch.manual_seed(0)
     model = HVNet(config).to(device).train()

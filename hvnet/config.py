@@ -17,6 +17,9 @@ from hvnet.cli import InputError
 
 MOST_CELLS = 2**26
 """Of the finest pseudo-image: 8192 x 8192, with 32 channels 8 GiB a sample."""
+MOST_CHANNELS = 4096
+MOST_LAYERS = 200
+"""Of a block; beyond these a config is taken for a mistake before it takes all memory."""
 
 
 @dataclass(frozen=True)
@@ -269,7 +272,9 @@ def _check(config: Config, source: str) -> None:
     for r, (fine, coarse) in enumerate(zip(encoder.projection_scales, encoder.projection_scales[1:], strict=False)):
         want(coarse == 2 * fine, f"encoder.projection_scales[{r + 1}]", f"twice the scale before, {2 * fine}", coarse)
     for key in ("feature_channels", "image_channels"):
-        want(getattr(encoder, key) > 0, f"encoder.{key}", "1 or more", getattr(encoder, key))
+        want(
+            0 < getattr(encoder, key) <= MOST_CHANNELS, f"encoder.{key}", f"1 to {MOST_CHANNELS}", getattr(encoder, key)
+        )
     finest = [v * encoder.projection_scales[0] for v in encoder.voxel_size]
     cells = math.prod((b - a) / v for a, b, v in zip(low, high, finest, strict=False))
     want(
@@ -282,11 +287,14 @@ def _check(config: Config, source: str) -> None:
     for key in ("widths", "layers"):
         values = getattr(backbone, key)
         want(len(values) == blocks, f"backbone.{key}", f"{blocks} values, one a block", list(values))
-    want(min(backbone.widths) > 0, "backbone.widths", "values above 0", list(backbone.widths))
+    in_reach = min(backbone.widths) > 0 and max(backbone.widths) <= MOST_CHANNELS
+    want(in_reach, "backbone.widths", f"values from 1 to {MOST_CHANNELS}", list(backbone.widths))
+    want(max(backbone.layers) <= MOST_LAYERS, "backbone.layers", f"{MOST_LAYERS} or fewer", list(backbone.layers))
     want(
         min(backbone.layers) > 1, "backbone.layers", "2 or more (an image joins after the first)", list(backbone.layers)
     )
-    want(backbone.fusion_channels > 0, "backbone.fusion_channels", "1 or more", backbone.fusion_channels)
+    fusion = backbone.fusion_channels
+    want(0 < fusion <= MOST_CHANNELS, "backbone.fusion_channels", f"1 to {MOST_CHANNELS}", fusion)
     want(len(head.classes) > 0, "head.classes", "at least one class", [])
     names = [entry.name for entry in head.classes]
     want(len(set(names)) == len(names), "head.classes", "no class twice", names)

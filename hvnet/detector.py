@@ -8,7 +8,7 @@ everything up to the scores is one CUDA graph, and the boxes come to the host in
 import copy
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from numpy.typing import NDArray
@@ -23,6 +23,9 @@ from hvnet.model import Detections, HVNet, load_checkpoint, model_from_checkpoin
 
 SHIPPED = Path(__file__).resolve().parent / "weights" / "compact.pt"
 """The weights that come with the package: see docs/model_card.md."""
+
+MOST_GRAPHS = 4
+"""CUDA graphs that a detector keeps: each holds the memory of all that it calculates."""
 
 
 class Candidates(NamedTuple):
@@ -48,11 +51,11 @@ class Detector:
         model = copy.deepcopy(model).to(device).eval()
         self.encoder = FusedEncoder(model.encoder)
         self.backbone = fold_batch_norms(model.backbone).to(dtype=self.dtype)
-        heads = [head for head in model.heads if isinstance(head, Head)]
-        self.scores = [copy.deepcopy(head.score).to(dtype=self.dtype) for head in heads]
-        self.regressions = [regression_weight(head) for head in heads]
+        heads = [cast(Head, head) for head in model.heads]
+        self.score_layers = [copy.deepcopy(head.score).to(dtype=self.dtype) for head in heads]
+        self.regression_weights = [regression_weight(head) for head in heads]
         self.anchors = [model.anchors(label) for label in range(len(heads))]
-        self.graphs: dict[tuple[int, int], Graph] = {}
+        self.graphs: dict[tuple[int, int], Graph] = {}  # the last few, by batch size and number of points
 
     def __call__(self, points: Tensor | NDArray) -> Detections:
         """Points (N, 4), x, y, z in metres and reflectance in [0, 1], to boxes (M, 7), scores (M,), labels (M,).
@@ -64,6 +67,8 @@ class Detector:
     @torch.no_grad()
     def batch(self, clouds: Sequence[Tensor | NDArray]) -> list[Detections]:
         """The boxes of several clouds, detected together."""
+        if not clouds:
+            return []
         parts = [torch.as_tensor(cloud, dtype=torch.float32, device=self.device) for cloud in clouds]
         for part in parts:
             if part.ndim != 2 or part.shape[1] != 4:
@@ -75,15 +80,21 @@ class Detector:
         return self.suppress(self.candidates(levels, logits))
 
     def maps(self, points: Tensor, sample: Tensor, batch_size: int) -> tuple[list[Tensor], list[Tensor]]:
-        """Pyramid levels (B, C, N_L, N_W) / 2^k and the logits (B, A) of every class; on a GPU by a CUDA graph."""
+        """Pyramid levels (B, C, N_L, N_W) / 2^k and the logits (B, A) of every class; on a GPU by a CUDA graph.
+
+        They hold until the next call.
+        """
         if self.device.type != "cuda" or not self.encoder.is_nested(batch_size):
             return self.score(self.backbone(self.encode(points, sample, batch_size)))
         # the graph is for a number of points: the next power of two, filled up with points that are outside
-        capacity = max(1 << (len(points) - 1).bit_length(), 1024) if len(points) else 1024
+        capacity = 1 << max(len(points) - 1, 1023).bit_length()
         key = (batch_size, capacity)
-        if key not in self.graphs:
-            self.graphs[key] = Graph(self, batch_size, capacity)
-        return self.graphs[key](points, sample)
+        with torch.cuda.device(self.device):
+            if key not in self.graphs:
+                while len(self.graphs) >= MOST_GRAPHS:
+                    del self.graphs[next(iter(self.graphs))]
+                self.graphs[key] = Graph(self, batch_size, capacity)
+            return self.graphs[key](points, sample)
 
     def encode(self, points: Tensor, sample: Tensor, batch_size: int) -> list[Tensor]:
         """Pseudo-images, finest first, that hold until the next call."""
@@ -91,7 +102,7 @@ class Detector:
 
     def score(self, levels: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
         """The pyramid levels, and the logits (B, A) float32 of every class."""
-        maps = [score(levels[entry.level]) for score, entry in zip(self.scores, self.entries, strict=True)]
+        maps = [score(levels[entry.level]) for score, entry in zip(self.score_layers, self.entries, strict=True)]
         return levels, [each.permute(0, 2, 3, 1).reshape(len(each), -1).float() for each in maps]
 
     def candidates(self, levels: list[Tensor], logits: list[Tensor]) -> list[list[Candidates]]:
@@ -107,9 +118,9 @@ class Detector:
             at = (logits.sigmoid() > head.score_threshold).nonzero().squeeze(1)
             at = at[torch.sort(logits[at], descending=True, stable=True).indices[: head.candidates]]
         else:  # as many for every cloud, so that no length is read from the device
-            at = logits.topk(min(head.candidates, len(logits))).indices
+            at = torch.sort(logits, descending=True, stable=True).indices[: head.candidates]
         scores = logits[at].sigmoid()
-        values = regress(levels[entry.level][b], at, self.regressions[label], anchors_per_cell(entry))
+        values = regress(levels[entry.level][b], at, self.regression_weights[label], anchors_per_cell(entry))
         direction = values[:, 10:].argmax(dim=1) if head.direction else None
         boxes = decode(values[:, :8], values[:, 8:10], direction, self.anchors[label][at])
         return Candidates(boxes, scores, scores > head.score_threshold)
@@ -117,7 +128,7 @@ class Detector:
     def suppress(self, candidates: list[list[Candidates]]) -> list[Detections]:
         """Rotated NMS class by class, and the one transfer to the host."""
         head = self.config.head
-        rows, lengths = [], []
+        parts, lengths = [], []
         for of_sample in candidates:
             for label, (boxes, scores, valid) in enumerate(of_sample):
                 scores = scores.where(valid, -1.0)  # after all others
@@ -125,9 +136,9 @@ class Detector:
                 keep = keep & valid[order]
                 keep = keep & (keep.cumsum(0) <= head.detections)
                 columns = (scores[order], torch.full_like(scores, label), keep.float())
-                rows.append(torch.cat((boxes[order], torch.stack(columns, dim=1)), dim=1))
+                parts.append(torch.cat((boxes[order], torch.stack(columns, dim=1)), dim=1))
                 lengths.append(len(order))
-        found = torch.cat(rows).cpu().split(lengths)
+        found = torch.cat(parts).cpu().split(lengths)
         classes = len(self.classes)
         samples = [torch.cat(found[k : k + classes]) for k in range(0, len(found), classes)]
         kept = [rows[rows[:, 9] > 0] for rows in samples]
@@ -151,7 +162,7 @@ class Graph:
                 run()
         torch.cuda.current_stream(detector.device).wait_stream(side)
         self.graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self.graph):
+        with torch.cuda.graph(self.graph, stream=side, capture_error_mode="thread_local"):
             self.outputs = run()
 
     def __call__(self, points: Tensor, sample: Tensor) -> tuple[list[Tensor], list[Tensor]]:
@@ -166,7 +177,7 @@ class Graph:
 def fastest_dtype(device: torch.device) -> torch.dtype:
     """bfloat16 where the processor multiplies in it, else float32."""
     if device.type == "cuda":
-        return torch.bfloat16 if torch.cuda.is_bf16_supported(including_emulation=False) else torch.float32
+        return torch.bfloat16 if torch.cuda.get_device_capability(device) >= (8, 0) else torch.float32
     return torch.bfloat16 if torch.cpu._is_avx512_bf16_supported() else torch.float32
 
 
@@ -183,8 +194,9 @@ def fold_batch_norms(module: nn.Module) -> nn.Module:
             else:
                 layers.append(fold_batch_norms(layer))
         return nn.Sequential(*layers)
-    folded = copy.copy(module)
-    folded._modules = {name: child and fold_batch_norms(child) for name, child in module._modules.items()}
+    folded = copy.deepcopy(module)
+    for name, child in folded.named_children():
+        setattr(folded, name, fold_batch_norms(child))
     return folded
 
 

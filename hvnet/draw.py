@@ -30,9 +30,10 @@ def draw_bev(
     """Writes a bird's eye view: points (N, 4) coloured by height, true boxes (T, 7) and detections (M, 7).
 
     A line from each box's centre to its front shows the heading; detections carry their scores (M,), and labels (M,)
-    index the class names; those of scores below SHOWN_SCORE are not drawn.
+    index the class names; those of scores below SHOWN_SCORE are not drawn, nor boxes whose centre is outside the range.
     """
-    shown = scores >= SHOWN_SCORE
+    truth = truth[_is_near(truth, point_range)]
+    shown = (scores >= SHOWN_SCORE) & _is_near(boxes, point_range)
     boxes, scores, labels = boxes[shown], scores[shown], labels[shown]
     x_min, y_min, z_min, x_max, y_max, z_max = point_range
     inside = (points[:, 0] >= x_min) & (points[:, 0] < x_max) & (points[:, 1] >= y_min) & (points[:, 1] < y_max)
@@ -64,6 +65,13 @@ def draw_bev(
         axes.legend(handles=handles, loc="upper right", fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
+
+
+def _is_near(boxes: Tensor, point_range: Sequence[float]) -> Tensor:
+    """Which boxes (M, 7) have their centre in the range and a size that can be drawn."""
+    low, high = boxes.new_tensor(point_range).view(2, 3)[:, :2]
+    inside = ((boxes[:, :2] >= low) & (boxes[:, :2] < high)).all(dim=1)
+    return inside & (boxes[:, 3:5] < 10 * (high - low).max()).all(dim=1)
 
 
 def _outlines(boxes: Tensor, colour: str, width: float, label: str) -> LineCollection:

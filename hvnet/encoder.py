@@ -55,9 +55,11 @@ def moments(rows: Tensor) -> Tensor:
     return wide.T @ wide
 
 
-def has_variance(training: bool, rows: int) -> bool:
-    """Whether a batch of so many rows gives the statistics of a batch norm; of several ranks, together they do."""
-    return training and (rows > 1 or size() > 1)
+def has_variance(training: bool, rows: Tensor) -> bool:
+    """Whether the rows (N, C) of all ranks give the statistics of a batch norm: one or none has no variance."""
+    if not training or size() == 1:
+        return training and rows.shape[0] > 1
+    return joined(torch.full((), rows.shape[0], device=rows.device)).item() > 1
 
 
 def folded(linear: nn.Linear, norm: nn.BatchNorm1d, of_rows: Tensor | None) -> Tensor:
@@ -121,7 +123,7 @@ class AttentiveVFE(nn.Module):
         M is (N, q), or (0, q) unless it is to be kept, G' (V, q).
         """
         of_rows = None
-        if has_variance(self.training, points.shape[0]):
+        if has_variance(self.training, points):
             of_rows = joined(torch.stack([scale.moments for scale in voxels]).sum(dim=0))
         layer = torch.vstack((folded(self.knowledge, self.knowledge_norm, of_rows), norm))
         return [attend(features, points, scale.mean, layer, scale.segments, self.relu, keep) for scale in voxels]
@@ -160,7 +162,7 @@ class HybridVoxelEncoder(nn.Module):
     def point_features(self, points: Tensor, scales: dict[Grid, ScaleOfPoints]) -> list[tuple[Tensor, Tensor]]:
         """AVFE: points (N, d) to M (N, q) and G' (V, q) of every feature scale."""
         ones = torch.ones_like(points[:, :1])
-        training = has_variance(self.training, points.shape[0])
+        training = has_variance(self.training, points)
         of_rows = joined(moments(torch.cat((points, ones), dim=1))) if training else None
         weight = folded(self.avfe.features, self.avfe.features_norm, of_rows)
         features = torch.addmm(weight[-1], points, weight[:-1])
@@ -196,7 +198,7 @@ def batch_norm(norm: nn.BatchNorm1d, rows: Tensor) -> Tensor:
 
     A batch of fewer than two rows has no variance and takes the running one.
     """
-    if not has_variance(norm.training, rows.shape[0]):
+    if not has_variance(norm.training, rows):
         mean, variance = norm.get_buffer("running_mean"), norm.get_buffer("running_var")
     else:
         total, squares = column_sums(rows)
@@ -214,7 +216,7 @@ class FusedEncoder:
     """Inference with the weights of an encoder: the same images, with batch norms folded and nothing kept for training.
 
     Where the scales nest, nothing is read back from a GPU: arrays have the size of the points and counts stay on the
-    device. The images are reused: they hold until the next call, which clears the cells that this one wrote.
+    device. The images are reused: they hold until the next call, which clears them.
     """
 
     def __init__(self, encoder: HybridVoxelEncoder) -> None:

@@ -2,6 +2,7 @@
 
 import os
 import warnings
+from datetime import timedelta
 from typing import Any
 
 import torch
@@ -10,12 +11,15 @@ from torch import Tensor, nn
 
 
 def start(device: torch.device) -> torch.device:
-    """Joins the processes that torchrun started, if it did; returns the device of this one."""
+    """Joins the processes that torchrun started, if it did; returns the device of this one.
+
+    The first rank may generate scenes or build a database while the others wait, hence the long time-out.
+    """
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         if device.type == "cuda":
             device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
             torch.cuda.set_device(device)
-        dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+        dist.init_process_group("nccl" if device.type == "cuda" else "gloo", timeout=timedelta(hours=2))
     return device
 
 

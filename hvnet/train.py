@@ -13,6 +13,7 @@ import os
 import shutil
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -45,11 +46,14 @@ from hvnet.evaluate import CLASSES, evaluate, format_table
 from hvnet.model import HVNet, load_checkpoint, save_checkpoint, select_device
 
 DEMO = Path(__file__).resolve().parent.parent / "configs" / "demo.yaml"
+SAVE_SECONDS = 300.0
+"""A run is saved after every epoch, and within one after so many seconds."""
+
 CHANGEABLE = [
     f"train.{key}"
     for key in ("epochs", "learning_rate", "validate_every", "pictures", "workers", "skip_corrupt", "skip_non_finite")
 ]
-"""What may differ from the run that --resume takes up."""
+"""What may differ from the run that --resume takes up; the epochs only if the learning rate does not depend on them."""
 
 ROOM = 100 * 2**20
 """Bytes beside the checkpoints that a run may need on the disk."""
@@ -111,10 +115,10 @@ class TrainingFrames(Dataset[Sample]):
 
         Where frames that cannot be read are to be skipped, the next one that can be takes the place.
         """
+        if k in self.kept:
+            return self.kept[k]
         notes = ""
         for name in self.ids[k:] + self.ids[:k]:
-            if k in self.kept:
-                return self.kept[k]
             try:
                 frame = read_frame(self.root, name)
                 break
@@ -200,7 +204,7 @@ def read_batches(loader: DataLoader) -> Iterator[Batch]:
 class Progress(NamedTuple):
     """How far a run has come, and the sums of its losses in the epoch that is under way."""
 
-    epoch: int = 0  # epochs done
+    epoch: int = 0  # epochs done, with their validation
     batch: int = 0  # batches done of the next one
     step: int = 0
     sums: dict[str, float] | None = None
@@ -208,18 +212,23 @@ class Progress(NamedTuple):
 
 def train_epoch(
     model: HVNet,
+    joint: torch.nn.Module,
     optimizer: torch.optim.Optimizer,
     loader: DataLoader,
     progress: Progress,
     out: Path,
     said: set[str],
     signals: list[int],
-) -> Progress:
-    """The rest of an epoch; it ends early if a signal has come."""
+    save: Callable[[Progress], None],
+) -> tuple[Progress, bool]:
+    """The rest of an epoch's batches, and whether a signal has come: then it ends early.
+
+    `joint` is the model, with its gradients averaged over the ranks.
+    """
     device = next(model.parameters()).device
     config = model.config.train
     model.train()
-    joint = ranks.parallel(model)
+    saved = time.monotonic()
     epoch, batches, step = progress.epoch, progress.batch, progress.step
     sums = dict(progress.sums or {})
     assert isinstance(loader.batch_sampler, EpochOrder)
@@ -239,6 +248,7 @@ def train_epoch(
             group["lr"] = learning_rate(config, step, epoch, config.epochs * len(loader))
         say_once(batch.notes, said)
         batch = batch.to(device)
+        statistics = {name: buffer.clone() for name, buffer in model.named_buffers() if config.skip_non_finite}
         terms = model.loss(joint(batch.points, batch.sample, len(batch.boxes)), batch.boxes, batch.labels)
         loss = torch.stack(list(terms.values())).sum()
         optimizer.zero_grad(set_to_none=True)
@@ -253,12 +263,17 @@ def train_epoch(
             sums["batches"] = sums.get("batches", 0.0) + 1
         else:
             note_non_finite(out, epoch, step, losses[0], norm.item(), batch.names, config.skip_non_finite)
+            for name, buffer in model.named_buffers():  # the batch norms have seen what is not finite
+                buffer.copy_(statistics[name])
         step, batches = step + 1, batches + 1
         bar.set_postfix(loss=f"{losses[0]:.3f}", frames=f"{config.batch_size * (bar.format_dict['rate'] or 0):.1f}/s")
-        if stop and batches < len(loader):
+        if stop:
             bar.close()
-            return Progress(epoch, batches, step, sums)
-    return Progress(epoch + 1, 0, step, sums)
+            return Progress(epoch, batches, step, sums), True
+        if time.monotonic() - saved > SAVE_SECONDS:
+            save(Progress(epoch, batches, step, sums))
+            saved = time.monotonic()
+    return Progress(epoch, batches, step, sums), False
 
 
 def note_non_finite(out: Path, epoch: int, step: int, loss: float, norm: float, names: list[str], skip: bool) -> None:
@@ -304,7 +319,7 @@ def validate(model: HVNet, root: Path, ids: list[str], pictures: Path, said: set
 
 
 def trange_of_rank(count: int) -> Iterable[int]:
-    """Every so manieth number below count, this rank's share, with a progress bar."""
+    """This rank's share of the numbers below count, with a progress bar."""
     share = range(ranks.rank(), count, ranks.size())
     hidden = ranks.rank() > 0
     return tqdm(share, desc="validating", unit="frame", leave=False, dynamic_ncols=True, disable=hidden)
@@ -323,10 +338,14 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
     train_ids = read_split(root, config.train.train_split)
     val_ids = read_split(root, config.train.val_split)
     frames = hashlib.sha256(json.dumps([train_ids, val_ids]).encode()).hexdigest()
-    train_ids = check_frames(root, train_ids, config.train.skip_corrupt, say)
+    good_ids = check_frames(root, train_ids, config.train.skip_corrupt, say)
     check_frames(root, val_ids, False, say)
-    database = load_database(root, config, val_ids) if config.augment.objects else None
+    samples = config.augment.objects or config.augment.whole_frames
+    database = load_database(root, good_ids, val_ids, say) if samples else None
+    # the order of a run that goes on must not depend on which frames can be read: the next one takes a place
     order = EpochOrder(config.train.repeat * len(train_ids), batch_size, config.train.seed)
+    if order.count < ranks.size():
+        raise InputError(f"{root}: {order.count} frames for {ranks.size()} ranks; start fewer")
     # worker processes know no GPU; without them the frames lie on it
     place = device if config.train.workers == 0 else torch.device("cpu")
     loader: DataLoader = DataLoader(
@@ -338,6 +357,7 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
         persistent_workers=config.train.workers > 0,
         # a forked worker would inherit Warp, CUDA and the threads of this process
         multiprocessing_context="spawn" if config.train.workers else None,
+        worker_init_fn=ignore_signals,
     )
     model = HVNet(config).to(device)
     optimizer = torch.optim.Adam(
@@ -348,26 +368,31 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
     check_room(out, model)
     say(f"{len(train_ids)} frames to train, {len(val_ids)} to validate, on {device}; the run is {out}", flush=True)
 
+    def save(progress: Progress) -> None:
+        if ranks.rank() == 0:
+            save_run(checkpoint, model, optimizer, frames, progress)
+
     board = None
     if ranks.rank() == 0:
         out.mkdir(parents=True, exist_ok=True)
+        if not resume:
+            save(progress)  # a run that fails in its first epoch can go on
         keep_metrics(out / "metrics.jsonl", progress.epoch)
         board = SummaryWriter(str(out / "tensorboard"), purge_step=progress.epoch + 1)
-        if not resume:
-            save_run(checkpoint, model, optimizer, frames, progress)  # a run that fails in its first epoch can go on
     said: set[str] = set()
+    joint = ranks.parallel(model)
+    stop = False
     while progress.epoch < config.train.epochs:
         epoch = progress.epoch
-        progress = train_epoch(model, optimizer, loader, progress, out, said, signals)
-        if progress.epoch == epoch:  # a signal came
-            if board:
-                save_run(checkpoint, model, optimizer, frames, progress)
+        if not stop:
+            progress, stop = train_epoch(model, joint, optimizer, loader, progress, out, said, signals, save)
+            save(progress)  # before the validation
+        if stop:
             say(f"stopped in epoch {epoch + 1} after step {progress.step}; --resume goes on from there", flush=True)
             sys.exit(128 + signals[0] if signals else 1)
         sums = dict(progress.sums or {})
         count = max(1.0, sums.pop("batches", 0.0))
         losses = {name: total / count for name, total in sums.items()}
-        progress = progress._replace(sums=None)
         say(f"epoch {epoch + 1:3d}  " + "  ".join(f"{name} {value:.6f}" for name, value in losses.items()), flush=True)
         record: dict[str, Any] = {"epoch": epoch + 1, "step": progress.step, **losses}
         last = epoch + 1 == config.train.epochs
@@ -383,7 +408,9 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
             board.flush()
             with (out / "metrics.jsonl").open("a", encoding="utf-8") as file:
                 file.write(json.dumps(record) + "\n")
-            save_run(checkpoint, model, optimizer, frames, progress)
+        progress = Progress(epoch + 1, 0, progress.step)
+        save(progress)
+        stop = ranks.joined(torch.full((), float(len(signals)), device=device)).item() > 0
     if board:
         board.close()
     say(f"checkpoint: {checkpoint}\npictures:   {out / 'pictures'}")
@@ -408,6 +435,12 @@ def caught_signals() -> Iterator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def ignore_signals(_: int) -> None:
+    """For worker processes: a signal to the whole group is this process's matter, and they end with it."""
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def check_room(out: Path, model: HVNet) -> None:
@@ -448,23 +481,25 @@ def check_frame(root: Path, name: str) -> None:
         read_points(points)  # which says what is wrong
 
 
-def load_database(root: Path, config: Config, val_ids: list[str]) -> Database:
+def load_database(root: Path, train_ids: list[str], val_ids: list[str], say: Callable[..., None] = print) -> Database:
     """The root's ground-truth database without objects of validation frames.
 
-    Where there is none it is built, and kept in the root if that can be written.
+    Where there is none it is built of the training frames, by the first rank, and kept in the root if that can be
+    written.
     """
     path = root / FILE_NAME
-    if path.is_file():
-        database = read_database(path)
-    else:
-        database = build_database(root, config.train.train_split)
+    built = None
+    if ranks.rank() == 0 and not path.is_file():
+        built = build_database(root, train_ids)
         try:
-            write_database(path, database)
+            write_database(path, built)
         except OSError as error:
-            print(f"{path}: not kept ({error.strerror}); it will be built again")
+            say(f"{path}: not kept ({error.strerror}); it will be built again")
+    built = ranks.of_first(built)
+    database = built if built is not None else read_database(path)
     leaked = np.isin(database.frame, [int(name) for name in val_ids if name.isdecimal()])
     if leaked.any():
-        print(f"{path}: {int(leaked.sum())} objects of validation frames are left out")
+        say(f"{path}: {int(leaked.sum())} objects of validation frames are left out")
         database = database.select(~leaked)
     return database
 
@@ -496,7 +531,8 @@ def restore(path: Path, model: HVNet, optimizer: torch.optim.Optimizer, frames: 
     content = load_checkpoint(path)
     here = config_to_dict(model.config)
     changed = sorted(key for key, _ in set(_leaves(content["config"])) ^ set(_leaves(here)))
-    changed = [key for key in changed if key not in CHANGEABLE]
+    fixed = {"train.epochs"} if model.config.train.cosine else set()
+    changed = [key for key in changed if key not in CHANGEABLE or key in fixed]
     if changed:
         raise InputError(f"{path}: was trained with another {changed[0]}; give its config, or another --out")
     if content.get("frames") != frames:
@@ -535,7 +571,10 @@ def keep_metrics(path: Path, epochs: int) -> None:
     """Leaves a line for each epoch that is done: a run may have stopped in or after a line, before its checkpoint."""
     if path.is_file():
         lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-        path.write_text("".join(lines[:epochs]), encoding="utf-8")
+        if len(lines) > epochs:
+            partial = path.with_suffix(".partial")
+            partial.write_text("".join(lines[:epochs]), encoding="utf-8")
+            partial.replace(path)
 
 
 def choose_out(given: str | None, config: Path, resume: bool) -> Path:
@@ -596,11 +635,9 @@ def main(arguments: Sequence[str] | None) -> None:
             distance = (4.0, min(reach - 2, 80.0))
             generate(root, scenes.train_frames, scenes.val_frames, config.train.seed, Options(distance=distance))
         ranks.of_first(None)  # the others wait for the scenes
-    try:
-        with caught_signals() as signals:
-            train(config, root, out, device, options.resume, signals)
-    finally:
-        ranks.stop()
+    with caught_signals() as signals:
+        train(config, root, out, device, options.resume, signals)
+    ranks.stop()  # not after an error: the others are still at work, and torchrun ends them
 
 
 if __name__ == "__main__":

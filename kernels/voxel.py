@@ -104,7 +104,7 @@ def voxel_index(points: Tensor, sample: Tensor, batch_size: int, grids: Sequence
 
     A point is kept iff it is inside every grid. Where each cell is a power of two times the finest, one sort by the
     Morton key of the finest grid makes every voxel of every scale a run of consecutive points; other scales, and grids
-    too large for a key (more than 2^31 cells in all samples), go through the hash table.
+    too large for a key (more than 2^31 cells, were they a square, in all samples), go through the hash table.
     """
     _check_points(points, sample)
     if not grids:

@@ -17,7 +17,7 @@ from hvnet.data.database import (
     read_database,
     write_database,
 )
-from hvnet.data.kitti import Calibration, write_calibration, write_points
+from hvnet.data.kitti import Calibration, read_split, write_calibration, write_points
 
 # a camera at the LiDAR's origin that looks along +x
 CALIB = Calibration(
@@ -69,7 +69,7 @@ def assert_same(a: Database, b: Database) -> None:
 
 
 def test_build_database(root: Path) -> None:
-    database = build_database(root, "train")
+    database = build_database(root, read_split(root, "train"))
     assert len(database) == 4
     assert database.name.tolist() == ["Car", "Pedestrian"] * 2
     assert database.frame.tolist() == [3, 3, 7, 7]
@@ -86,14 +86,14 @@ def test_build_database(root: Path) -> None:
 
 
 def test_object_points(root: Path) -> None:
-    database = build_database(root, "train")
+    database = build_database(root, read_split(root, "train"))
     points = object_points(database)
     assert points.dtype == torch.float32
     assert torch.equal(points[database.offsets[2] : database.offsets[3]], torch.from_numpy(POINTS[[0, 2]]))
 
 
 def test_write_and_read(root: Path) -> None:
-    database = build_database(root, "train")
+    database = build_database(root, read_split(root, "train"))
     write_database(root / "a.npz", database)
     assert_same(read_database(root / "a.npz"), database)
     assert not list(root.glob("*.partial"))
@@ -102,13 +102,13 @@ def test_write_and_read(root: Path) -> None:
 def test_a_failed_write_leaves_nothing(root: Path) -> None:
     (root / "folder.npz").mkdir()
     with pytest.raises(OSError, match=re.escape("folder.npz")):
-        write_database(root / "folder.npz", build_database(root, "train"))
+        write_database(root / "folder.npz", build_database(root, read_split(root, "train")))
     assert not list(root.glob("*.partial"))
 
 
 def test_real_database_is_reproduced(kitti_root: Path) -> None:
     """Every point, its order and its reflectance; the yaw may differ in the last bit of its float32."""
-    built = build_database(kitti_root, "train")
+    built = build_database(kitti_root, read_split(kitti_root, "train"))
     real = read_database(kitti_root / "gt_database.npz")
     rows = np.flatnonzero(np.isin(real.frame, built.frame))
     assert len(rows) == len(built) == 153
@@ -139,7 +139,7 @@ def test_real_database_is_reproduced(kitti_root: Path) -> None:
     ],
 )
 def test_broken_arrays_are_named(root: Path, changes: dict[str, np.ndarray | None], message: str) -> None:
-    database = build_database(root, "train")
+    database = build_database(root, read_split(root, "train"))
     path = root / "broken.npz"
     arrays = {name: getattr(database, name) for name in LAYOUT} | changes
     np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
@@ -151,7 +151,7 @@ def test_broken_files_are_named(root: Path) -> None:
     path = root / "a.npz"
     with pytest.raises(InputError, match=re.escape(f"{path}: no such file; build it with")):
         read_database(path)
-    write_database(path, build_database(root, "train"))
+    write_database(path, build_database(root, read_split(root, "train")))
     whole = path.read_bytes()
     damaged = whole[:60] + bytes(20) + whole[80:]
     for content in (b"", b"no archive", whole[: len(whole) // 2], damaged):
@@ -163,7 +163,7 @@ def test_broken_files_are_named(root: Path) -> None:
 def test_a_frame_that_is_no_number_is_named(root: Path) -> None:
     write_frame(root, "street", OBJECTS)
     with pytest.raises(InputError, match=re.escape(f"{root}: frame 'street' of split 'train' is no number")):
-        build_database(root, "train")
+        build_database(root, read_split(root, "train"))
 
 
 def test_a_split_without_objects_is_named(tmp_path: Path) -> None:
@@ -171,13 +171,13 @@ def test_a_split_without_objects_is_named(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=re.escape(f"{tmp_path}: no object is labelled in the frames of split 'train'")
     ):
-        build_database(tmp_path, "train")
+        build_database(tmp_path, read_split(tmp_path, "train"))
 
 
 def test_command(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["--data", str(root)])
     path = root / "gt_database.npz"
-    assert_same(read_database(path), build_database(root, "train"))
+    assert_same(read_database(path), build_database(root, read_split(root, "train")))
     assert "4 objects, 6 points" in capsys.readouterr().out
     with pytest.raises(InputError, match=re.escape(f"{path}: exists already")):
         main(["--data", str(root)])

@@ -25,11 +25,20 @@ class Objects(NamedTuple):
 
     database: Database
     points: Tensor  # (M, 4) of all objects, on the device of the frames
+    of_class: dict[str, np.ndarray]  # rows of each class that `sample_objects` draws from
+    of_frame: list[np.ndarray]  # rows of each frame that `sample_frame` inserts
 
 
 def objects_of(database: Database, device: torch.device) -> Objects:
-    """The database with its points on a device."""
-    return Objects(database, object_points(database).to(device))
+    """The database with its points on a device, and its rows by class and by frame."""
+    has_points = np.diff(database.offsets) >= MIN_POINTS
+    # rated by KITTI: easy, moderate or hard; SECOND leaves out the others
+    rated = (database.bbox_height > 25) & (database.occlusion <= 2) & (database.truncation <= 0.5)
+    of_class = {str(n): np.flatnonzero(rated & has_points & (database.name == n)) for n in np.unique(database.name)}
+    by_frame = np.argsort(database.frame, kind="stable")
+    _, starts = np.unique(database.frame[by_frame], return_index=True)
+    of_frame = [rows[has_points[rows]] for rows in np.split(by_frame, starts[1:])]
+    return Objects(database, object_points(database).to(device), of_class, of_frame)
 
 
 def augment(
@@ -152,14 +161,12 @@ def sample_objects(
     labels (M,) int64 number the boxes' classes in `classes`; boxes of any other number only block their place. Of each
     class in `counts` so many objects are drawn, without replacement, that the frame has this count of them.
     """
-    database = objects.database
     drawn: list[np.ndarray] = [np.empty(0, np.int64)]
     drawn_labels: list[int] = []
-    usable = _usable(database)
     for name, count in counts.items():
         label = classes.index(name)
         missing = max(0, count - int((labels == label).sum()))
-        known = np.flatnonzero(usable & (database.name == name))
+        known = objects.of_class.get(name, drawn[0])
         picked = torch.randperm(len(known), generator=generator)[:missing].numpy()
         drawn.append(known[picked])
         drawn_labels += [label] * len(picked)
@@ -171,11 +178,8 @@ def sample_frame(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Inserts all objects of one frame of the database, so that they stand together as they did: a queue at a light,
     cars along a kerb. Those of other classes come with them and have label -1."""
-    database = objects.database
-    frames = np.unique(database.frame)
-    frame = frames[int(torch.randint(len(frames), (), generator=generator))]
-    drawn = np.flatnonzero((database.frame == frame) & (np.diff(database.offsets) >= MIN_POINTS))
-    drawn_labels = [classes.index(name) if name in classes else -1 for name in database.name[drawn]]
+    drawn = objects.of_frame[int(torch.randint(len(objects.of_frame), (), generator=generator))]
+    drawn_labels = [classes.index(name) if name in classes else -1 for name in objects.database.name[drawn]]
     return _insert(points, boxes, labels, objects, drawn, drawn_labels)
 
 
@@ -200,12 +204,6 @@ def _insert(
     offsets = objects.database.offsets
     points = torch.cat([points, *(objects.points[offsets[k] : offsets[k + 1]] for k in drawn[inserted])])
     return points, torch.cat((boxes, new_boxes)), torch.cat((labels, labels.new_tensor(drawn_labels)[inserted]))
-
-
-def _usable(database: Database) -> np.ndarray:
-    """Which objects (K,) are rated by KITTI (easy, moderate or hard; SECOND leaves out the others) and have points."""
-    rated = (database.bbox_height > 25) & (database.occlusion <= 2) & (database.truncation <= 0.5)
-    return rated & (np.diff(database.offsets) >= MIN_POINTS)
 
 
 def _uniform(low: float, high: float, generator: Generator) -> float:

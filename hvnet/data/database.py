@@ -84,16 +84,16 @@ def object_points(database: Database) -> Tensor:
     return torch.from_numpy(points)
 
 
-def build_database(root: Path, split: str) -> Database:
-    """Cuts every labelled object out of the frames of a split of a KITTI root.
+def build_database(root: Path, names: Sequence[str]) -> Database:
+    """Cuts every labelled object out of these frames of a KITTI root.
 
     An object's points are those in or on its box, of the whole cloud: a truncated one has points beside the image.
     """
     columns: dict[str, list[NDArray]] = {field.name: [] for field in fields(Database) if field.name != "offsets"}
     counts: list[int] = []
-    for frame_id in tqdm(read_split(root, split), desc="objects", unit="frame"):
+    for frame_id in tqdm(names, desc="objects", unit="frame"):
         if not frame_id.isdecimal():
-            raise InputError(f"{root}: frame '{frame_id}' of split '{split}' is no number; the database keeps numbers")
+            raise InputError(f"{root}: frame '{frame_id}' is no number; the database keeps numbers")
         frame = read_frame(root, frame_id, crop=False)
         rows = np.flatnonzero(frame.labels.name != "DontCare")
         labels = frame.labels.select(rows)
@@ -115,7 +115,7 @@ def build_database(root: Path, split: str) -> Database:
         columns["occlusion"].append(labels.occlusion)
         columns["bbox_height"].append(labels.bbox[:, 3] - labels.bbox[:, 1])
     if not counts:
-        raise InputError(f"{root}: no object is labelled in the frames of split '{split}'")
+        raise InputError(f"{root}: no object is labelled in its {len(names)} frames")
     arrays = {name: np.concatenate(parts, axis=-1 if name == "xyz_mm" else 0) for name, parts in columns.items()}
     arrays["offsets"] = np.cumsum([0, *counts])
     return Database(**{name: array.astype(LAYOUT[name][1]) for name, array in arrays.items()})
@@ -180,7 +180,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise InputError(f"{out}: exists already; remove it or name another file with --out")
     if not os.access(out.parent, os.W_OK):  # known before the minutes of work, not after
         raise InputError(f"{out.parent}: no folder that can be written to; name a file elsewhere with --out")
-    database = build_database(options.data, options.split)
+    database = build_database(options.data, read_split(options.data, options.split))
     try:
         write_database(out, database)
     except OSError as error:
