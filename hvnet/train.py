@@ -45,7 +45,7 @@ from hvnet.draw import draw_bev
 from hvnet.evaluate import CLASSES, evaluate, format_table
 from hvnet.model import HVNet, load_checkpoint, save_checkpoint, select_device
 
-DEMO = Path(__file__).resolve().parent.parent / "configs" / "demo.yaml"
+DEMO = Path(__file__).resolve().parent / "configs" / "demo.yaml"
 SAVE_SECONDS = 300.0
 """A run is saved after every epoch, and within one after so many seconds."""
 

@@ -124,10 +124,11 @@ def test_twins_need_no_warp() -> None:
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
 
 
-def test_symlink() -> None:
-    link = ROOT / "hvnet" / "kernels"
+@pytest.mark.parametrize("name", ["kernels", "configs"])
+def test_symlink(name: str) -> None:
+    link = ROOT / "hvnet" / name
     assert link.is_symlink()
-    assert link.readlink() == Path("../kernels")
+    assert link.readlink() == Path("..") / name
     assert not (ROOT / "kernels" / "__init__.py").exists()
 
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import torch
 
 from hvnet import train
-from hvnet.cli import InputError, run_command
+from hvnet.cli import run_command
 from hvnet.model import load_checkpoint, save_checkpoint
 
-CONFIG = Path(__file__).resolve().parents[2] / "configs" / "compact.yaml"
+CONFIG = Path(__file__).resolve().parents[1] / "configs" / "compact.yaml"
 RECIPE = (
     "train.epochs=32",
     "train.repeat=20",
@@ -52,8 +52,6 @@ def main(arguments: Sequence[str] | None) -> None:
     parser.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
     options = parser.parse_args(arguments)
-    if not CONFIG.is_file():
-        raise InputError(f"{CONFIG}: no such file; run this in a clone of the project, installed with pip install -e .")
     command = ["--config", str(CONFIG), "--data", str(options.data), "--out", str(options.run)]
     command += ["--device", options.device, *(["--resume"] if options.resume else [])]
     train.main(command + [part for change in RECIPE for part in ("--set", change)])
