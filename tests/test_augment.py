@@ -51,7 +51,8 @@ def make_objects(objects: list[tuple[str, list[float]]], points_each: int = 10, 
     box = np.array([box for _, box in objects], dtype=np.float32).reshape(-1, 7)
     xyz_mm = np.zeros((3, count * points_each), dtype=np.int16)
     xyz_mm[0] = np.tile(np.arange(points_each), count)
-    arrays = {"truncation": [0.0] * count, "occlusion": [0] * count, "bbox_height": [40.0] * count} | columns
+    arrays = {"truncation": [0.0] * count, "occlusion": [0] * count, "bbox_height": [40.0] * count}
+    arrays |= {"frame": [0] * count} | columns
     database = Database(
         xyz_mm=xyz_mm,
         reflectance=np.full(count * points_each, 50, dtype=np.uint8),
@@ -59,7 +60,7 @@ def make_objects(objects: list[tuple[str, list[float]]], points_each: int = 10, 
         centre_mm=(box[:, :3] * 1000).round().astype(np.int32),
         box=box,
         name=np.array([name for name, _ in objects], dtype=np.str_),
-        frame=np.zeros(count, dtype=np.int32),
+        frame=np.array(arrays["frame"], dtype=np.int32),
         label_row=np.arange(count, dtype=np.int16),
         truncation=np.array(arrays["truncation"], dtype=np.float32),
         occlusion=np.array(arrays["occlusion"], dtype=np.int8),
@@ -257,8 +258,7 @@ def test_no_objects_asked_for() -> None:
 
 def test_a_whole_frame_keeps_together() -> None:
     objects = [("Car", car(10.0 * k, 0)) for k in range(4)] + [("Van", car(50, 0)), ("Pedestrian", car(60, 0))]
-    database = make_objects(objects)
-    database.database.frame[:] = [3, 7, 7, 3, 7, 7]
+    database = make_objects(objects, frame=[3, 7, 7, 3, 7, 7])
     found = set()
     for seed in range(10):
         points, boxes, labels = sample_frame(torch.zeros(0, 4), *no_boxes(), database, seeded(seed), CLASSES)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from hvnet.anchors import assign_targets, decode, encode, make_anchors
 from hvnet.boxes import bev_corners
-from hvnet.config import Config, load_config
+from hvnet.config import Config, LossConfig, load_config
 from hvnet.head import HeadMaps, anchor_rows
 from hvnet.kernels import reference
 from hvnet.loss import class_loss, focal_loss
@@ -213,11 +213,14 @@ def test_class_loss_by_hand(demo: Config) -> None:
     targets = assign_targets(anchors, [torch.tensor([[0.0, 0, 0.3, 4, 2, 1.5, 0]])], 0.5, 0.35)
     assert targets.positive.tolist() == [[True, True, False]]
     maps = HeadMaps(torch.zeros(1, 3), torch.zeros(1, 3, 8), torch.zeros(1, 3, 2), torch.zeros(1, 3, 2))
-    terms = class_loss(maps, targets, entry, demo.loss)
+    terms = class_loss(maps, targets, entry, LossConfig())
     assert terms["classification"].item() == pytest.approx(3 * 0.5 * math.log(2) / 2)
     assert terms["localization"].item() == pytest.approx(4 * 0.5 * 0.1**2 / 2)  # four x offsets of -0.1 m
     assert terms["vertical"].item() == pytest.approx(1.5 * 2 * 0.5 * 0.2**2 / 2)
     assert terms["direction"].item() == pytest.approx(0.2 * math.log(2))
+    terms = class_loss(maps, targets, entry, LossConfig(beta=0.05))  # from 0.05 on linear
+    assert terms["localization"].item() == pytest.approx(4 * (0.1 - 0.025) / 2)
+    assert terms["vertical"].item() == pytest.approx(1.5 * 2 * (0.2 - 0.025) / 2)
 
 
 def test_loss_without_boxes_is_finite(demo: Config) -> None:

@@ -27,7 +27,7 @@ def test_four_real_frames_are_learnt_by_heart(kitti_root: Path, tmp_path: Path) 
         + [f"augment.{change}" for change in plain]
         + [f"train.{change}" for change in [*schedule, "validate_every=60"]],
     )
-    train(config, root, tmp_path / "run", torch.device("cpu"), resume=False)
+    train(config, root, tmp_path / "run", torch.device("cpu"), resume=False, signals=[])
     last = json.loads((tmp_path / "run" / "metrics.jsonl").read_text().splitlines()[-1])
     easy, moderate, hard = last["validation"]["Car"]["exact"]["bev"]
     assert min(easy, moderate, hard) >= 90
