@@ -11,7 +11,7 @@ from torch import Tensor
 from hvnet.boxes import bev_corners
 
 TRUTH_COLOUR = "#1a9850"
-SHOWN_SCORE = 0.3
+SHOWN_SCORE = 0.5
 """Detections below are left out of pictures, which they would only fill."""
 CLASS_COLOURS = ("#d62728", "#1f77b4", "#ff7f0e", "#9467bd")
 

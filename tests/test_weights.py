@@ -1,0 +1,62 @@
+"""The weights of the package: small, loadable, and made by a command."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import hvnet
+from hvnet.cli import InputError
+from hvnet.config import config_to_dict, load_config
+from hvnet.data.kitti import read_frame, read_split
+from hvnet.detector import SHIPPED
+from hvnet.kernels.rotated import rotated_iou_bev
+from hvnet.model import HVNet, load_checkpoint, save_checkpoint
+from hvnet.weights.__main__ import CONFIG, RECIPE, halve, main
+
+
+def test_the_shipped_weights() -> None:
+    assert SHIPPED.stat().st_size <= 10e6
+    content = load_checkpoint(SHIPPED)
+    assert content.keys() == {"config", "model"}
+    recipe = load_config(CONFIG, RECIPE)
+    assert content["config"] == config_to_dict(recipe)
+    for name, value in content["model"].items():
+        wanted = torch.int64 if name.endswith("tracked") else torch.float32 if "running" in name else torch.float16
+        assert value.dtype == wanted, name
+        assert value.isfinite().all(), name
+
+
+def test_half_precision_changes_little(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    config = load_config(CONFIG)
+    model = HVNet(config)
+    save_checkpoint(tmp_path / "whole.pt", {"config": config_to_dict(config), "model": model.state_dict(), "step": 3})
+    halve(tmp_path / "whole.pt", tmp_path / "half.pt")
+    half = HVNet(config)
+    half.load_state_dict(load_checkpoint(tmp_path / "half.pt")["model"])
+    for (name, a), b in zip(model.state_dict().items(), half.state_dict().values(), strict=True):
+        assert b.dtype == a.dtype
+        torch.testing.assert_close(b, a, rtol=1e-3, atol=1e-6, msg=name)
+
+
+def test_cars_are_found_in_real_frames(kitti_root: Path) -> None:
+    """In frames that it was not trained on: most cars that a camera sees well and a scanner hits often."""
+    detector = hvnet.load(device="cpu")
+    seen = found = 0
+    for name in read_split(kitti_root, "val"):
+        frame = read_frame(kitti_root, name)
+        boxes, scores, labels = detector(frame.points)
+        assert boxes.shape == (len(scores), 7)
+        labelled = frame.labels.select(frame.labels.name != "DontCare")
+        cars = frame.boxes[(labelled.name == "Car") & (labelled.occlusion <= 1)]
+        mine = boxes[(labels == 0) & (scores > 0.3)]
+        seen += len(cars)
+        found += int((rotated_iou_bev(cars, mine).amax(1, keepdim=True) > 0.5).sum()) if len(mine) else 0
+    assert seen > 10
+    assert found > 0.6 * seen, (found, seen)
+
+
+def test_the_command_refuses_what_is_no_root(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=str(tmp_path)):
+        main(["--data", str(tmp_path), "--run", str(tmp_path / "run"), "--device", "cpu"])
