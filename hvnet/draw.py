@@ -39,7 +39,8 @@ def draw_bev(
     inside = (points[:, 0] >= x_min) & (points[:, 0] < x_max) & (points[:, 1] >= y_min) & (points[:, 1] < y_max)
     x, y, z = points[inside, :3].cpu().numpy().T
     width = 8.0
-    figure = Figure(figsize=(width, 0.9 + width * (x_max - x_min) / (y_max - y_min)), layout="constrained")
+    height = min(max(width * (x_max - x_min) / (y_max - y_min), 2.0), 50.0)  # inches; matplotlib has its limits
+    figure = Figure(figsize=(width, 0.9 + height), layout="constrained")
     axes = figure.add_subplot()
     axes.scatter(-y, x, s=0.4, c=z, cmap="viridis", vmin=z_min, vmax=min(z_max, 1.0), linewidths=0)
     handles = []

@@ -15,6 +15,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -100,15 +101,16 @@ class TrainingFrames(Dataset[Sample]):
         options = self.config.augment
         generator = seeded(self.config.train.seed, epoch, k)
         frame = self.read(k % len(self.ids))
-        points, boxes, labels = frame.points, frame.boxes, frame.labels
+        points, boxes, labels, note = frame.points, frame.boxes, frame.labels, frame.note
         if options.mix and torch.rand((), generator=generator).item() < options.mix:
             other = self.read(int(torch.randint(len(self.ids), (), generator=generator)))
             others = (other.points, other.boxes, other.labels)
             points, boxes, labels = mix_sectors(points, boxes, labels, others, generator)
+            note = "\n".join(filter(None, (note, other.note)))
         points, boxes, labels = augment(points, boxes, labels, self.objects, options, generator, self.classes)
         low, high = boxes.new_tensor(self.config.encoder.point_range).view(2, 3)
         inside = ((boxes[:, :2] >= low[:2]) & (boxes[:, :2] < high[:2])).all(dim=1) & (labels >= 0)
-        return Sample(points, boxes[inside], labels[inside], frame.note, frame.name)
+        return Sample(points, boxes[inside], labels[inside], note, frame.name)
 
     def read(self, k: int) -> Sample:
         """Frame k as it is; boxes of classes that are not trained have label -1.
@@ -331,6 +333,8 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
     If one of the `signals` comes, the run is saved after the step that is under way, and ends.
     """
     make_deterministic(config.train.seed)
+    if device.type == "cuda":  # the frames lie on the device, and worker processes have none
+        config = replace(config, train=replace(config.train, workers=0))
     say = print if ranks.rank() == 0 else lambda *_, **__: None
     batch_size = config.train.batch_size
     if batch_size % ranks.size():
@@ -365,7 +369,6 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
     )
     checkpoint = out / "checkpoint.pt"
     progress = restore(checkpoint, model, optimizer, frames) if resume else Progress()
-    check_room(out, model)
     say(f"{len(train_ids)} frames to train, {len(val_ids)} to validate, on {device}; the run is {out}", flush=True)
 
     def save(progress: Progress) -> None:
@@ -388,6 +391,7 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
             progress, stop = train_epoch(model, joint, optimizer, loader, progress, out, said, signals, save)
             save(progress)  # before the validation
         if stop:
+            ranks.of_first(None)  # torchrun ends the others as soon as one has ended: not while the first still writes
             say(f"stopped in epoch {epoch + 1} after step {progress.step}; --resume goes on from there", flush=True)
             sys.exit(128 + signals[0] if signals else 1)
         sums = dict(progress.sums or {})
@@ -625,6 +629,8 @@ def main(arguments: Sequence[str] | None) -> None:
             raise InputError(f"{where}: unknown class '{entry.name}'; known are {', '.join(CLASSES)}")
     device = ranks.start(select_device(options.device))
     out = ranks.of_first(choose_out(options.out, options.config, options.resume) if ranks.rank() == 0 else None)
+    if ranks.rank() == 0:
+        check_room(out, HVNet(config))
     root = options.data
     if root is None:
         if config.synthetic is None:

@@ -46,7 +46,7 @@ ALLOWED = {f"kernels.{name}": allowed for name, allowed in KERNELS.items()} | {
     "matching": ANY_KERNEL | {"boxes", "data.kitti"},
     "evaluate": {"boxes", "matching", "data.kitti"},
     "weights.__init__": set(),
-    "weights.__main__": {"model", "train"},
+    "weights.__main__": {"data.database", "model", "train"},
     "train": NETWORK | DATA | {"model", "detector", "draw", "evaluate", "ranks"},
     "detect": NETWORK | DATA | {"model", "detector", "draw", "evaluate"},
 }

@@ -397,7 +397,8 @@ train.main(sys.argv[3:])
 
 
 # the place, the call of it that is killed (of notes: two in the steps of an epoch, two in its validation), epochs saved
-PLACES = [("step", 2, 0), ("step", 4, 0), ("step", 6, 1), ("save", 2, 0), ("save", 3, 0), ("save", 4, 1)]
+RANDOM = np.random.default_rng(0).integers(1, 9, 3).tolist()
+PLACES = [("step", count, (count - 1) // 4) for count in RANDOM] + [("save", 2, 0), ("save", 3, 0), ("save", 4, 1)]
 
 
 @pytest.mark.parametrize(("place", "count", "epochs"), PLACES)
@@ -433,6 +434,20 @@ def test_a_full_disk_leaves_the_last_checkpoint(scenes: Path, begun: Path, train
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert (begun / "checkpoint.pt").read_bytes() == before
     assert not (begun / "checkpoint.partial").exists()
+
+
+def test_a_run_on_a_full_disk_goes_on(scenes: Path, begun: Path, tmp_path: Path) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limits[1]))
+    try:
+        with pytest.raises(InputError, match=r"checkpoint\.pt: cannot be written"):
+            run(scenes, begun, "train.epochs=3", resume=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    run(scenes, begun, "train.epochs=3", resume=True)
+    run(scenes, tmp_path / "whole", "train.epochs=3")
+    assert same(load_checkpoint(begun / "checkpoint.pt"), load_checkpoint(tmp_path / "whole" / "checkpoint.pt"))
+    assert metrics(begun) == metrics(tmp_path / "whole")
 
 
 def test_a_disk_without_room_is_found_before_the_run(

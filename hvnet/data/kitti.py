@@ -341,7 +341,8 @@ def project_boxes(
     begin, end = corners[:, EDGES[:, 0]], corners[:, EDGES[:, 1]]  # (M, 12, 3)
     crosses = (begin[..., 2] < NEAR) != (end[..., 2] < NEAR)
     share = np.where(crosses, NEAR - begin[..., 2], 0) / np.where(crosses, end[..., 2] - begin[..., 2], 1)
-    outline = np.concatenate((corners, begin + share[..., None] * (end - begin)), axis=1)  # (M, 20, 3)
+    with np.errstate(all="ignore"):  # of boxes that are beyond all measure
+        outline = np.concatenate((corners, begin + share[..., None] * (end - begin)), axis=1)  # (M, 20, 3)
     front = np.concatenate((corners[..., 2] >= NEAR, crosses), axis=1)
     pixels = outline[..., :2] / np.where(front, outline[..., 2], 1)[..., None]
     least = np.where(front[..., None], pixels, np.inf).min(axis=1)

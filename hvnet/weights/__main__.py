@@ -11,7 +11,8 @@ from pathlib import Path
 import torch
 
 from hvnet import train
-from hvnet.cli import run_command
+from hvnet.cli import InputError, run_command
+from hvnet.data.database import FILE_NAME
 from hvnet.model import load_checkpoint, save_checkpoint
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "compact.yaml"
@@ -52,6 +53,9 @@ def main(arguments: Sequence[str] | None) -> None:
     parser.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
     options = parser.parse_args(arguments)
+    if not (options.data / FILE_NAME).is_file():
+        raise InputError(f"{options.data / FILE_NAME}: no such file; other objects would make other weights")
+    options.out.parent.mkdir(parents=True, exist_ok=True)
     command = ["--config", str(CONFIG), "--data", str(options.data), "--out", str(options.run)]
     command += ["--device", options.device, *(["--resume"] if options.resume else [])]
     train.main(command + [part for change in RECIPE for part in ("--set", change)])
