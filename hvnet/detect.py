@@ -245,7 +245,8 @@ def main(arguments: Sequence[str] | None) -> None:
         description="Detects objects in point clouds; writes KITTI result files (results/), all boxes in LiDAR axes\n"
         "(boxes.csv) and bird's eye views (pictures/). Where every cloud is a KITTI frame with labels, the\n"
         "results are scored, too. --split test writes submission.zip for the KITTI server.",
-        epilog="examples:\n  python -m hvnet.detect cloud.pcd --checkpoint runs/demo/checkpoint.pt\n"
+        epilog="examples:\n  python -m hvnet.detect cloud.bin\n"
+        "  python -m hvnet.detect cloud.pcd --checkpoint runs/demo/checkpoint.pt\n"
         "  python -m hvnet.detect clouds/ --checkpoint runs/demo/checkpoint.pt --pictures 0\n"
         "  python -m hvnet.detect /data/kitti --split val --checkpoint runs/compact/checkpoint.pt --out val\n"
         "  python -m hvnet.detect /data/kitti --split test --checkpoint runs/hvnet/checkpoint.pt --out test",
@@ -262,7 +263,13 @@ def main(arguments: Sequence[str] | None) -> None:
         "--partial", action="store_true", help="with --split test: take the frames there are; no submission is written"
     )
     parser.add_argument("--out", type=Path, default=Path("detections"), metavar="DIR", help="(default: detections)")
-    parser.add_argument("--pictures", type=int, default=20, metavar="N", help="draw the first N clouds (default: 20)")
+    parser.add_argument(
+        "--pictures",
+        type=int,
+        default=20,
+        metavar="N",
+        help="draw the first N clouds, with boxes of score 0.5 or more (default: 20)",
+    )
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
     options = parser.parse_args(arguments)
 
