@@ -10,7 +10,6 @@ nothing, so its threshold is 0, which sends as many candidates into decoding and
 """
 
 import copy
-import csv
 import dataclasses
 import sys
 import tempfile
@@ -21,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from timing import agree, parser, read_scene, start
+from timing import agree, parser, read_scene, start, synchronise, write_rows
 from torch import Tensor
 
 from hvnet.cli import InputError, run_command
@@ -81,12 +80,6 @@ def samples(clouds: Sequence[Tensor]) -> Tensor:
     return torch.repeat_interleave(torch.arange(len(clouds)), torch.tensor([len(cloud) for cloud in clouds]))
 
 
-def synchronise(device: torch.device) -> None:
-    """Waits for the device."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-
-
 def main(argv: Sequence[str] | None = None) -> None:
     """The command."""
     arguments = parser("detect", __doc__, repeat=20)
@@ -131,12 +124,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                     row = {"config": name, "batch": batch, "dtype": str(detector.dtype), "stage": stage}
                     rows.append(row | {"p50_ms": f"{p50:.6g}", "p95_ms": f"{p95:.6g}", "calls": repeat})
                 sys.stdout.flush()
-    args.csv.parent.mkdir(parents=True, exist_ok=True)
-    with args.csv.open("w", newline="", encoding="utf-8") as table:
-        writer = csv.DictWriter(table, [*rows[0], *bench.machine])
-        writer.writeheader()
-        writer.writerows(row | bench.machine for row in rows)
-    print(f"\nwritten: {args.csv}")
+    write_rows(args.csv, rows, bench.machine)
 
 
 if __name__ == "__main__":

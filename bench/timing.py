@@ -106,16 +106,11 @@ class Bench:
 
     def write(self, csv_file: Path, json_file: Path | None) -> None:
         """Writes every row with the machine's columns, and the same as JSON."""
-        csv_file.parent.mkdir(parents=True, exist_ok=True)
-        with csv_file.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, [*Row.__dataclass_fields__, *self.machine])
-            writer.writeheader()
-            for row in self.rows:
-                digits = {
-                    key: f"{value:.6g}" if isinstance(value, float) else value for key, value in asdict(row).items()
-                }
-                writer.writerow(digits | self.machine)
-        print(f"\nwritten: {csv_file}")
+        rows = [
+            {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in asdict(row).items()}
+            for row in self.rows
+        ]
+        write_rows(csv_file, rows, self.machine)
         if json_file:
             tree = {"machine": self.machine, "rows": [asdict(row) for row in self.rows]}
             json_file.write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
@@ -157,6 +152,22 @@ def timed(run: Run, device: torch.device) -> float:
     begin = time.perf_counter()
     run()
     return time.perf_counter() - begin
+
+
+def synchronise(device: torch.device) -> None:
+    """Waits for the device."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def write_rows(path: Path, rows: list[dict[str, object]], machine: dict[str, str | int | float]) -> None:
+    """Writes rows that have the same columns, each with the machine's."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [*rows[0], *machine])
+        writer.writeheader()
+        writer.writerows(row | machine for row in rows)
+    print(f"\nwritten: {path}")
 
 
 def peak_memory(run: Run, device: torch.device) -> float:

@@ -5,7 +5,6 @@ own objects; the whole step is timed again without stops between the stages.
 """
 
 import argparse
-import csv
 import sys
 import tempfile
 import time
@@ -15,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from timing import parser, start
+from timing import parser, start, synchronise, write_rows
 
 from hvnet.cli import InputError, run_command
 from hvnet.config import Config, load_config
@@ -80,12 +79,6 @@ def time_steps(config: Config, root: Path, device: torch.device, repeat: int) ->
     return {stage: seconds[2:] for stage, seconds in times.items()}  # two to warm up
 
 
-def synchronise(device: torch.device) -> None:
-    """Waits for the device."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-
-
 def main(argv: Sequence[str] | None = None) -> None:
     """The command."""
     arguments: argparse.ArgumentParser = parser("train", __doc__, repeat=10)
@@ -116,12 +109,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 row = {"config": name, "batch": batch, "bfloat16": config.train.bfloat16, "stage": stage}
                 rows.append(row | {"p50_ms": f"{p50:.6g}", "p95_ms": f"{p95:.6g}", "steps": args.repeat})
             sys.stdout.flush()
-    args.csv.parent.mkdir(parents=True, exist_ok=True)
-    with args.csv.open("w", newline="", encoding="utf-8") as table:
-        writer = csv.DictWriter(table, [*rows[0], *bench.machine])
-        writer.writeheader()
-        writer.writerows(row | bench.machine for row in rows)
-    print(f"\nwritten: {args.csv}")
+    write_rows(args.csv, rows, bench.machine)
 
 
 if __name__ == "__main__":
