@@ -66,7 +66,7 @@ class Detector:
 
     @torch.no_grad()
     def batch(self, clouds: Sequence[Tensor | NDArray]) -> list[Detections]:
-        """The boxes of several clouds, detected together."""
+        """The boxes of several clouds (N, 4), detected together. Raises ValueError for points of another shape."""
         if not clouds:
             return []
         parts = [torch.as_tensor(cloud, dtype=torch.float32, device=self.device) for cloud in clouds]
@@ -146,7 +146,7 @@ class Detector:
 
 
 class Graph:
-    """The CUDA graph of encoder, backbone and scores for a batch size and a number of points."""
+    """The CUDA graph of encoder, backbone and scores for a batch of one size, and at most `capacity` points (N, 4)."""
 
     def __init__(self, detector: Detector, batch_size: int, capacity: int) -> None:
         self.points = torch.full((capacity, 4), torch.nan, device=detector.device)  # not finite, hence outside

@@ -303,7 +303,7 @@ def validate(model: HVNet, root: Path, ids: list[str], pictures: Path, said: set
     detector = Detector(model, next(model.parameters()).device)
     classes = list(detector.classes)
     found_here: list[tuple[Labels, Labels]] = []
-    for k in trange_of_rank(len(ids)):
+    for k in share_of_rank(len(ids)):
         name = ids[k]
         frame = read_frame(root, name)
         say_once([frame.note], said)
@@ -320,7 +320,7 @@ def validate(model: HVNet, root: Path, ids: list[str], pictures: Path, said: set
     return evaluate([labels for labels, _ in both], [rows for _, rows in both], classes=classes)
 
 
-def trange_of_rank(count: int) -> Iterable[int]:
+def share_of_rank(count: int) -> Iterable[int]:
     """This rank's share of the numbers below count, with a progress bar."""
     share = range(ranks.rank(), count, ranks.size())
     hidden = ranks.rank() > 0

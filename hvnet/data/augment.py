@@ -176,8 +176,10 @@ def sample_objects(
 def sample_frame(
     points: Tensor, boxes: Tensor, labels: Tensor, objects: Objects, generator: Generator, classes: Sequence[str]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Inserts all objects of one frame of the database, so that they stand together as they did: a queue at a light,
-    cars along a kerb. Those of other classes come with them and have label -1."""
+    """Inserts all objects of one frame of the database into points (N, 4), boxes (M, 7) and labels (M,).
+
+    They stand together as they did: a queue at a light, cars along a kerb. Those of other classes have label -1.
+    """
     drawn = objects.of_frame[int(torch.randint(len(objects.of_frame), (), generator=generator))]
     drawn_labels = [classes.index(name) if name in classes else -1 for name in objects.database.name[drawn]]
     return _insert(points, boxes, labels, objects, drawn, drawn_labels)
