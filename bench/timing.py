@@ -24,6 +24,7 @@ from torch.profiler import ProfilerActivity, profile
 from hvnet.cli import InputError
 from hvnet.data.kitti import drop_non_finite, read_frame, read_points
 from hvnet.data.synthetic import Options, make_frame
+from hvnet.model import device_name
 
 RESULTS = Path(__file__).resolve().parent / "results"
 PACKAGES = ("torch", "warp-lang", "torch-scatter", "numba", "shapely")
@@ -262,7 +263,7 @@ def start(name: str, args: argparse.Namespace) -> Bench:
     device = torch.device(args.device)
     peak = measure_peak(device)
     machine: dict[str, str | int | float] = {
-        "device": torch.cuda.get_device_name() if args.device == "cuda" else processor(),
+        "device": device_name(device),
         "threads": args.threads,
         "copy_gb_s": round(peak.copy / 1e9, 1),
         "product_gflop_s": round(peak.product / 1e9, 1),
@@ -275,14 +276,6 @@ def start(name: str, args: argparse.Namespace) -> Bench:
             machine[package] = ""
     print(", ".join(f"{key} {value}" for key, value in machine.items() if value != ""))
     return Bench(device, args.repeat, peak, machine)
-
-
-def processor() -> str:
-    """The CPU's name."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def read_scene(file: Path | None) -> Tensor:

@@ -15,13 +15,15 @@ ORIENTATIONS = (0.0, math.pi / 4, math.pi / 2, 3 * math.pi / 4)
 
 
 class Targets(NamedTuple):
-    """What the loss wants of the anchors of one class, over a batch."""
+    """What the loss wants of the anchors of one class, over a batch: P are positive, in the order of nonzero()."""
 
     positive: Tensor  # (B, A) bool
     negative: Tensor  # (B, A) bool; anchors that are neither count for nothing
-    corners: Tensor  # (P, 8) metres, of the positive anchors in the order of positive.nonzero()
+    location: Tensor  # (P, 8) metres, or (P, 5)
     vertical: Tensor  # (P, 2)
     direction: Tensor  # (P,) int64
+    anchors: Tensor  # (P, 7)
+    boxes: Tensor  # (P, 7) that they are matched to
 
 
 def anchors_per_cell(entry: ClassConfig) -> int:
@@ -32,7 +34,8 @@ def anchors_per_cell(entry: ClassConfig) -> int:
 def make_anchors(config: Config, entry: ClassConfig) -> Tensor:
     """Anchors (A, 7) of a class at the centres of its level's cells, in the order (x, y, size, orientation)."""
     grid = projection_grids(config.encoder)[0]
-    step = 2 ** (pyramid_depth(config.encoder) - 3 + entry.level)  # the levels start at the third last block
+    # the levels start at the third last block
+    step = config.backbone.stride * 2 ** (pyramid_depth(config.encoder) - 3 + entry.level)
     cell = (grid.cell[0] * step, grid.cell[1] * step)
     x = grid.x_min + (torch.arange(grid.shape[0] // step, dtype=torch.float64) + 0.5) * cell[0]
     y = grid.y_min + (torch.arange(grid.shape[1] // step, dtype=torch.float64) + 0.5) * cell[1]
@@ -49,51 +52,56 @@ def make_anchors(config: Config, entry: ClassConfig) -> Tensor:
     return torch.stack([column.expand(shape) for column in columns], dim=-1).reshape(-1, 7).float()
 
 
-def encode(boxes: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Boxes (P, 7) against anchors (P, 7): corner offsets (P, 8), vertical (P, 2), direction (P,) int64.
+def encode(boxes: Tensor, anchors: Tensor, regression: str = "corners") -> tuple[Tensor, Tensor, Tensor]:
+    """Boxes (P, 7) against anchors (P, 7): location (P, 8) or (P, 5), vertical (P, 2), direction (P,) int64.
 
-    Corners are offsets in metres of the half-turn of the box that is nearer to the anchor; direction is 1 where that is
-    not the box's own heading. Vertical is (dz / anchor height, log(h / anchor height)) as in VoxelNet.
+    Both are those of the half-turn of the box that is nearer to the anchor; direction is 1 where that is not the box's
+    own heading. The location of "corners" is their offsets in metres, that of "pose" (dx / diagonal, dy / diagonal,
+    log(l / anchor length), log(w / anchor width), dtheta); vertical is (dz / anchor height, log(h / anchor height)),
+    these as in VoxelNet.
     """
     turned = limit_angle(boxes[:, 6] - anchors[:, 6]).abs() > math.pi / 2
     nearer = boxes.clone()
     nearer[:, 6] = torch.where(turned, boxes[:, 6] + math.pi, boxes[:, 6])
-    corners = (bev_corners(nearer) - bev_corners(anchors)).flatten(1)
+    if regression == "corners":
+        location = (bev_corners(nearer) - bev_corners(anchors)).flatten(1)
+    else:
+        shift = (boxes[:, :2] - anchors[:, :2]) / anchors[:, 3:5].norm(dim=1, keepdim=True)
+        size = (boxes[:, 3:5] / anchors[:, 3:5]).log()
+        location = torch.cat((shift, size, limit_angle(nearer[:, 6:] - anchors[:, 6:])), dim=1)
     height = anchors[:, 5]
     vertical = torch.stack(((boxes[:, 2] - anchors[:, 2]) / height, (boxes[:, 5] / height).log()), dim=1)
-    return corners, vertical, turned.long()
+    return location, vertical, turned.long()
 
 
-def decode(corners: Tensor, vertical: Tensor, direction: Tensor | None, anchors: Tensor) -> Tensor:
+def decode(location: Tensor, vertical: Tensor, direction: Tensor | None, anchors: Tensor) -> Tensor:
     """Inverse of `encode`: boxes (P, 7), up to a half-turn if direction, (P,) int64, is None.
 
-    Centre = mean of the corners; the axis is the sum of the edges along the box; length and width are means of opposite
-    edges.
+    Of corners (P, 8) the centre is the mean; the axis is the sum of the edges along the box; length and width are means
+    of opposite edges.
     """
-    front_left, front_right, rear_right, rear_left = (bev_corners(anchors) + corners.view(-1, 4, 2)).unbind(1)
-    centre = (front_left + front_right + rear_right + rear_left) / 4
-    left, right = front_left - rear_left, front_right - rear_right
-    front, rear = front_left - front_right, rear_left - rear_right
-    axis = left + right
-    yaw = torch.atan2(axis[:, 1], axis[:, 0])
+    if location.shape[1] == 5:
+        centre = anchors[:, :2] + location[:, :2] * anchors[:, 3:5].norm(dim=1, keepdim=True)
+        length, width = (anchors[:, 3:5] * location[:, 2:4].exp()).unbind(1)
+        yaw = anchors[:, 6] + location[:, 4]
+    else:
+        front_left, front_right, rear_right, rear_left = (bev_corners(anchors) + location.view(-1, 4, 2)).unbind(1)
+        centre = (front_left + front_right + rear_right + rear_left) / 4
+        left, right = front_left - rear_left, front_right - rear_right
+        front, rear = front_left - front_right, rear_left - rear_right
+        length, width = (left.norm(dim=1) + right.norm(dim=1)) / 2, (front.norm(dim=1) + rear.norm(dim=1)) / 2
+        axis = left + right
+        yaw = torch.atan2(axis[:, 1], axis[:, 0])
     if direction is not None:
         yaw = yaw + math.pi * direction.to(yaw.dtype)
     height = anchors[:, 5]
-    return torch.stack(
-        (
-            centre[:, 0],
-            centre[:, 1],
-            anchors[:, 2] + vertical[:, 0] * height,
-            (left.norm(dim=1) + right.norm(dim=1)) / 2,
-            (front.norm(dim=1) + rear.norm(dim=1)) / 2,
-            vertical[:, 1].exp() * height,
-            limit_angle(yaw),
-        ),
-        dim=1,
-    )
+    z, h = anchors[:, 2] + vertical[:, 0] * height, vertical[:, 1].exp() * height
+    return torch.stack((centre[:, 0], centre[:, 1], z, length, width, h, limit_angle(yaw)), dim=1)
 
 
-def assign_targets(anchors: Tensor, boxes: list[Tensor], positive_iou: float, negative_iou: float) -> Targets:
+def assign_targets(
+    anchors: Tensor, boxes: list[Tensor], positive_iou: float, negative_iou: float, regression: str = "corners"
+) -> Targets:
     """Matches anchors (A, 7) of a class to its boxes, one (M_b, 7) a sample, by rotated IoU in bird's eye view.
 
     Positive: IoU above positive_iou, or the best anchor of a box (if it overlaps at all; of two boxes with one best
@@ -110,6 +118,6 @@ def assign_targets(anchors: Tensor, boxes: list[Tensor], positive_iou: float, ne
     is_forced = forced < len(every)
     match = torch.where(is_forced, forced, match)
     positive = (iou > positive_iou) | is_forced
-    at = positive.nonzero()
-    corners, vertical, direction = encode(every[match[positive]], anchors[at[:, 1]])
-    return Targets(positive, (iou < negative_iou) & ~positive, corners, vertical, direction)
+    of_positive, matched = anchors[positive.nonzero()[:, 1]], every[match[positive]]
+    negative = (iou < negative_iou) & ~positive
+    return Targets(positive, negative, *encode(matched, of_positive, regression), of_positive, matched)

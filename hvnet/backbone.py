@@ -1,6 +1,10 @@
-"""Backbone (Sec. 3.4): the main stream with multi-scale aggregation and the feature fusion pyramid network (FFPN)."""
+"""Backbone (Sec. 3.4): the main stream with multi-scale aggregation and the feature fusion pyramid network (FFPN).
+
+The pyramids that the paper compares it with have the same interface: B_1, B_2, B_3 to the levels that the heads see.
+"""
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from hvnet.config import BackboneConfig
@@ -42,16 +46,25 @@ class Block(nn.Module):
         return self.rest(features)
 
 
+def extended(values: tuple[int, ...], blocks: int) -> tuple[int, ...]:
+    """The values of the blocks; those of blocks that have none are the last."""
+    return values + values[-1:] * (blocks - len(values))
+
+
 class MainStream(nn.Module):
-    """Blocks 1, 2, ...: each but the first halves the map and takes in the next pseudo-image (Sec. 3.4)."""
+    """Blocks 1, 2, ...: each but the first halves the map and takes in the next pseudo-image (Sec. 3.4).
+
+    The first halves it only with a stride of 2, as that of PointPillars.
+    """
 
     def __init__(self, config: BackboneConfig, image_channels: int, images: int) -> None:
         super().__init__()
+        self.widths = extended(config.widths, images)
         blocks = []
         before = image_channels
-        for k, (width, layers) in enumerate(zip(config.widths, config.layers, strict=True)):
+        for k, (width, layers) in enumerate(zip(self.widths, extended(config.layers, images), strict=True)):
             joins = image_channels if 0 < k < images else 0
-            blocks.append(Block(before, joins, width, layers, stride=1 if k == 0 else 2))
+            blocks.append(Block(before, joins, width, layers, config.stride if k == 0 else 2))
             before = width
         self.blocks = nn.ModuleList(blocks)
 
@@ -106,14 +119,58 @@ class FFPN(nn.Module):
         return levels
 
 
+class FPN(nn.Module):
+    """Lin et al., CVPR 2017: 1 x 1 convolutions of the maps, the coarser sum enlarged and added, 3 x 3 convolutions."""
+
+    def __init__(self, widths: tuple[int, ...], channels: int) -> None:
+        super().__init__()
+        self.lateral = nn.ModuleList(nn.Conv2d(width, channels, 1) for width in widths)
+        self.smooth = nn.ModuleList(conv_bn_relu(channels, channels, 3) for _ in widths)
+
+    def forward(self, maps: list[Tensor]) -> list[Tensor]:
+        """B_1, B_2, B_3 to levels of the same resolutions, `channels` each."""
+        sums = [lateral(each) for lateral, each in zip(self.lateral, maps, strict=True)]
+        for k in (1, 0):
+            sums[k] = sums[k] + F.interpolate(sums[k + 1], scale_factor=2.0, mode="nearest")
+        return [smooth(each) for smooth, each in zip(self.smooth, sums, strict=True)]
+
+
+class NoPyramid(nn.Module):
+    """The SSD-like backbone of the paper's baseline: each level is a map of the main stream, brought to `channels`."""
+
+    def __init__(self, widths: tuple[int, ...], channels: int) -> None:
+        super().__init__()
+        self.reduce = nn.ModuleList(conv_bn_relu(width, channels, 1) for width in widths)
+
+    def forward(self, maps: list[Tensor]) -> list[Tensor]:
+        """B_1, B_2, B_3 to levels of the same resolutions, `channels` each."""
+        return [reduce(each) for reduce, each in zip(self.reduce, maps, strict=True)]
+
+
+class Upsampled(nn.Module):
+    """PointPillars (Lang et al., CVPR 2019): every map is enlarged to the finest by a deconvolution and joined."""
+
+    def __init__(self, widths: tuple[int, ...], channels: int) -> None:
+        super().__init__()
+        self.up = nn.ModuleList(deconv_bn_relu(width, channels, 2**k) for k, width in enumerate(widths))
+
+    def forward(self, maps: list[Tensor]) -> list[Tensor]:
+        """B_1, B_2, B_3 to one level of B_1's resolution, 3 x `channels`."""
+        return [torch.cat([up(each) for up, each in zip(self.up, maps, strict=True)], dim=1)]
+
+
+PYRAMIDS = {"ffpn": FFPN, "fpn": FPN, "none": NoPyramid, "upsampled": Upsampled}
+
+
 class Backbone(nn.Module):
-    """Main stream and FFPN: pseudo-images to three pyramid levels."""
+    """Main stream and pyramid: pseudo-images to the pyramid's levels."""
 
     def __init__(self, config: BackboneConfig, image_channels: int, images: int) -> None:
         super().__init__()
         self.main_stream = MainStream(config, image_channels, images)
-        self.ffpn = FFPN(config.widths[-3:], config.fusion_channels)
+        self.pyramid = PYRAMIDS[config.pyramid](self.main_stream.widths[-3:], config.fusion_channels)
+        self.channels = config.fusion_channels * (3 if config.pyramid == "upsampled" else 1)  # of every level
 
     def forward(self, images: list[Tensor]) -> list[Tensor]:
-        """Pseudo-images (B, N_H, N_L, N_W) / 2^r to pyramid levels (B, C, N_L, N_W) / 2^k."""
-        return self.ffpn(self.main_stream(images))
+        """Pseudo-images (B, N_H, N_L, N_W) / 2^r to levels (B, channels, N_L, N_W) / 2^k, three but for "upsampled"."""
+        return self.pyramid(self.main_stream(images))

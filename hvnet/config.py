@@ -9,7 +9,7 @@ import typing
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
@@ -32,15 +32,21 @@ class EncoderConfig:
     projection_scales: tuple[float, ...] = (1.0, 2.0, 4.0)  # S_R, each twice the one before
     feature_channels: int = 64  # q
     image_channels: int = 128  # N_H
+    # AVFE and AVFEO; VoxelNet's VFE layers in their place; or one layer of PointPillars' features
+    vfe: Literal["attentive", "plain", "pillar"] = "attentive"
     attention_relu: bool = False  # a ReLU before the product of the AVFE layers
+    point_limit: int = 0  # most points of a voxel of voxel_size, and most such voxels of a sample, as networks of hard
+    voxel_limit: int = 0  # voxels have them: the points beyond are dropped; 0 is no limit
 
 
 @dataclass(frozen=True)
 class BackboneConfig:
-    """Main stream and FFPN: one width and one number of layers a block."""
+    """Main stream and pyramid: one width and one number of layers a block; further blocks are like the last named."""
 
     widths: tuple[int, ...] = (64, 128, 256)
     layers: tuple[int, ...] = (3, 5, 5)
+    stride: int = 1  # of the first block: PointPillars has 2
+    pyramid: Literal["ffpn", "fpn", "none", "upsampled"] = "ffpn"  # "upsampled": PointPillars' one map for all classes
     fusion_channels: int = 128  # of each Psi and of each pyramid level
 
 
@@ -64,7 +70,9 @@ class HeadConfig:
     """Detection heads, and what `detect` reports."""
 
     classes: tuple[ClassConfig, ...]
+    regression: Literal["corners", "pose"] = "corners"  # of the BEV box: its corners, or x, y, l, w and theta
     direction: bool = False  # the two-bin heading branch
+    iou: bool = False  # a branch that predicts the box's IoU, by which its score is multiplied
     score_threshold: float = 0.2
     candidates: int = 1000  # best-scored anchors of a class that go into NMS
     detections: int = 100  # most boxes a class reports
@@ -72,12 +80,15 @@ class HeadConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the total loss (the paper's lambdas; the direction branch has SECOND's 0.2), and smooth L1's shape."""
+    """Weights of the total loss (the paper's lambdas; the direction branch has SECOND's 0.2), and what is summed."""
 
     localization: float = 1.0
     classification: float = 1.0
     vertical: float = 1.5
     direction: float = 0.2
+    iou: float = 1.0
+    box: Literal["smooth_l1", "iou", "giou"] = "smooth_l1"  # what localization weighs: offsets, or 1 - IoU or GIoU
+    uncertainty: bool = False  # the weights are learnt, too (Kendall et al., CVPR 2018)
     beta: float = 1.0  # error at which smooth L1 turns linear: metres for corners; SECOND's sigma of 3 is 1/9
 
 
@@ -141,10 +152,29 @@ class Config:
     synthetic: SyntheticConfig | None = None
 
 
-def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
-    """Reads a YAML file and applies overrides such as "train.epochs=3". Raises InputError naming file and key."""
+def load_config(path: str | Path, overrides: Sequence[str] = (), instead: tuple[Path, Path] | None = None) -> Config:
+    """Reads a YAML file and applies overrides such as "train.epochs=3".
+
+    A file with a key `base`, the path of another file from its own folder, holds only the differences to that one. They
+    are laid over it: mappings key by key; over the list of classes goes a mapping by their names; null takes a key or
+    a class away. With `instead`, (file, other), the other takes the file's place among the bases.
+
+    Raises InputError naming file and key.
+    """
+    tree = _read_chain(Path(path), instead, ())
+    for override in overrides:
+        _override(tree, override)
+    return config_from_dict(tree, str(path))
+
+
+def _read_chain(path: Path, instead: tuple[Path, Path] | None, seen: tuple[Path, ...]) -> dict[str, Any]:
+    """The tree of a file, laid over that of its base."""
+    if instead is not None and path.resolve() == instead[0].resolve():
+        return _read_chain(instead[1], None, ())
+    if path.resolve() in seen:
+        raise InputError(f"{path}: base: is its own base; name another file")
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read ({error}); give an existing YAML file") from error
     try:
@@ -153,9 +183,31 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
         raise InputError(f"{path}: is no valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(tree, dict):
         raise InputError(f"{path}: want a mapping with the keys {', '.join(_keys(Config))}")
-    for override in overrides:
-        _override(tree, override)
-    return config_from_dict(tree, str(path))
+    if "base" not in tree:
+        return tree
+    below = tree.pop("base")
+    if not isinstance(below, str):
+        raise InputError(f"{path}: base: want the path of a YAML file, got {below!r}")
+    return _laid_over(_read_chain(path.parent / below, instead, (*seen, path.resolve())), tree, str(path), "")
+
+
+def _laid_over(below: Any, above: Any, source: str, key: str) -> Any:
+    """The value `above` laid over the value `below` of a dotted key."""
+    if not isinstance(above, dict):
+        return above
+    if isinstance(below, list) and all(isinstance(entry, dict) and "name" in entry for entry in below):
+        named = {str(entry["name"]): entry for entry in below}
+        unknown = [str(name) for name in above if name not in named]
+        if unknown:
+            raise InputError(f"{source}: {key}.{unknown[0]}: no such entry below; known: {', '.join(named)}")
+        return list(_laid_over(named, above, source, key).values())
+    made = dict(below) if isinstance(below, dict) else {}
+    for name, value in above.items():
+        if value is None:
+            made.pop(name, None)
+        else:
+            made[name] = _laid_over(made.get(name), value, source, f"{key}.{name}" if key else str(name))
+    return made
 
 
 def config_from_dict(tree: dict[str, Any], source: str) -> Config:
@@ -179,15 +231,21 @@ def _plain(value: Any) -> Any:
 
 
 def _override(tree: dict[str, Any], override: str) -> None:
+    """Sets KEY=VALUE in the tree; a class is a key of the list of classes."""
     key, equals, text = override.partition("=")
     if not equals or not key:
         raise InputError(f"--set {override}: want KEY=VALUE, such as train.epochs=3")
     *parents, last = key.split(".")
-    node = tree
+    node: Any = tree
     for parent in parents:
-        node = node.setdefault(parent, {})
-        if not isinstance(node, dict):
+        if isinstance(node, list):
+            node = next((entry for entry in node if entry.get("name") == parent), None)
+        else:
+            node = node.setdefault(parent, {})
+        if not isinstance(node, dict) and not (isinstance(node, list) and parent == "classes"):
             raise InputError(f"--set {override}: {parent} is no group of keys")
+    if isinstance(node, list):
+        raise InputError(f"--set {override}: {parents[-1]} is no group of keys")
     try:
         node[last] = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError) as error:
@@ -223,6 +281,10 @@ def _build(kind: Any, value: Any, key: str, source: str) -> Any:
                 raise InputError(f"{source}: {where}: missing; it has no default")
         return kind(**made)
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Literal:
+        if value not in inner or not isinstance(value, str):
+            raise wrong(f"one of {', '.join(inner)}")
+        return value
     if origin is types.UnionType:
         return None if value is None else _build(inner[0], value, key, source)
     if origin is tuple:
@@ -283,10 +345,23 @@ def _check(config: Config, source: str) -> None:
         f"at most {MOST_CELLS} cells in the finest projection",
         f"{cells:.3g}",
     )
+    for key in ("point_limit", "voxel_limit"):
+        want(getattr(encoder, key) >= 0, f"encoder.{key}", "0 (none) or more", getattr(encoder, key))
+    want(encoder.voxel_limit == 0 or encoder.point_limit > 0, "encoder.voxel_limit", "a point_limit beside it", "none")
+    if encoder.vfe == "pillar":
+        want(encoder.projection_scales == (1.0,), "encoder.projection_scales", "[1.0] for pillars",
+             list(encoder.projection_scales))  # fmt: skip
+        want(encoder.point_limit > 0, "encoder.point_limit", "1 or more for pillars", encoder.point_limit)
+        padded = encoder.point_limit * (encoder.voxel_limit or MOST_CELLS)
+        want(padded <= MOST_CELLS, "encoder.voxel_limit", f"at most {MOST_CELLS} places of points in pillars", padded)
     blocks = max(3, len(encoder.projection_scales))
+    want(backbone.stride in (1, 2), "backbone.stride", "1 or 2", backbone.stride)
+    want(backbone.stride == 1 or len(encoder.projection_scales) == 1, "backbone.stride",
+         "1 where a second image joins", backbone.stride)  # fmt: skip
     for key in ("widths", "layers"):
         values = getattr(backbone, key)
-        want(len(values) == blocks, f"backbone.{key}", f"{blocks} values, one a block", list(values))
+        wanted = "3 values" if blocks == 3 else f"3 to {blocks} values"
+        want(3 <= len(values) <= blocks, f"backbone.{key}", f"{wanted}, one a block", list(values))
     in_reach = min(backbone.widths) > 0 and max(backbone.widths) <= MOST_CHANNELS
     want(in_reach, "backbone.widths", f"values from 1 to {MOST_CHANNELS}", list(backbone.widths))
     want(max(backbone.layers) <= MOST_LAYERS, "backbone.layers", f"{MOST_LAYERS} or fewer", list(backbone.layers))
@@ -300,7 +375,8 @@ def _check(config: Config, source: str) -> None:
     want(len(set(names)) == len(names), "head.classes", "no class twice", names)
     for k, entry in enumerate(head.classes):
         key = f"head.classes[{k}]"
-        want(0 <= entry.level < 3, f"{key}.level", "0, 1 or 2", entry.level)
+        levels = 1 if backbone.pyramid == "upsampled" else 3
+        want(0 <= entry.level < levels, f"{key}.level", "0, 1 or 2" if levels == 3 else "0, the only one", entry.level)
         want(len(entry.anchor_sizes) > 0, f"{key}.anchor_sizes", "at least one size", [])
         for size in entry.anchor_sizes:
             want(min(size) > 0, f"{key}.anchor_sizes", "sizes above 0", list(size))
@@ -313,7 +389,7 @@ def _check(config: Config, source: str) -> None:
     want(0 <= head.score_threshold < 1, "head.score_threshold", "at least 0 and below 1", head.score_threshold)
     for key in ("candidates", "detections"):
         want(getattr(head, key) > 0, f"head.{key}", "1 or more", getattr(head, key))
-    for weight in _keys(LossConfig):
+    for weight in ("localization", "classification", "vertical", "direction", "iou"):
         want(getattr(config.loss, weight) >= 0, f"loss.{weight}", "0 or more", getattr(config.loss, weight))
     want(config.loss.beta > 0, "loss.beta", "above 0", config.loss.beta)
     augment = config.augment

@@ -17,7 +17,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from hvnet.anchors import anchors_per_cell, decode
 from hvnet.encoder import FusedEncoder
-from hvnet.head import Head
+from hvnet.head import LOCATION_VALUES, Head, scores_of
 from hvnet.kernels.rotated import nms_order
 from hvnet.model import Detections, HVNet, load_checkpoint, model_from_checkpoint, select_device
 
@@ -52,7 +52,11 @@ class Detector:
         self.encoder = FusedEncoder(model.encoder)
         self.backbone = fold_batch_norms(model.backbone).to(dtype=self.dtype)
         heads = [cast(Head, head) for head in model.heads]
-        self.score_layers = [copy.deepcopy(head.score).to(dtype=self.dtype) for head in heads]
+        # the score's branch of every class, and that of the IoU if there is one
+        self.score_layers = [
+            [copy.deepcopy(branch).to(dtype=self.dtype) for branch in (head.score, head.iou) if branch is not None]
+            for head in heads
+        ]
         self.regression_weights = [regression_weight(head) for head in heads]
         self.anchors = [model.anchors(label) for label in range(len(heads))]
         self.graphs: dict[tuple[int, int], Graph] = {}  # the last few, by batch size and number of points
@@ -76,15 +80,15 @@ class Detector:
         points = torch.cat(parts)
         lengths = torch.tensor([len(part) for part in parts])
         sample = torch.repeat_interleave(torch.arange(len(parts)), lengths).to(self.device)
-        levels, logits = self.maps(points, sample, len(parts))
-        return self.suppress(self.candidates(levels, logits))
+        levels, scores = self.maps(points, sample, len(parts))
+        return self.suppress(self.candidates(levels, scores))
 
     def maps(self, points: Tensor, sample: Tensor, batch_size: int) -> tuple[list[Tensor], list[Tensor]]:
-        """Pyramid levels (B, C, N_L, N_W) / 2^k and the logits (B, A) of every class; on a GPU by a CUDA graph.
+        """Pyramid levels (B, C, N_L, N_W) / 2^k and the scores (B, A) of every class; on a GPU by a CUDA graph.
 
         They hold until the next call.
         """
-        if self.device.type != "cuda" or not self.encoder.is_nested(batch_size):
+        if self.device.type != "cuda" or not self.encoder.is_fused(batch_size):
             return self.score(self.backbone(self.encode(points, sample, batch_size)))
         # the graph is for a number of points: the next power of two, filled up with points that are outside
         capacity = 1 << max(len(points) - 1, 1023).bit_length()
@@ -101,28 +105,33 @@ class Detector:
         return self.encoder(points, sample, batch_size, self.dtype)
 
     def score(self, levels: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        """The pyramid levels, and the logits (B, A) float32 of every class."""
-        maps = [score(levels[entry.level]) for score, entry in zip(self.score_layers, self.entries, strict=True)]
-        return levels, [each.permute(0, 2, 3, 1).reshape(len(each), -1).float() for each in maps]
+        """The pyramid levels, and the scores (B, A) float32 of every class."""
+        scores = []
+        for layers, entry in zip(self.score_layers, self.entries, strict=True):
+            maps = [layer(levels[entry.level]).permute(0, 2, 3, 1) for layer in layers]
+            logits, *iou = [each.reshape(len(each), -1).float() for each in maps]
+            scores.append(scores_of(logits, iou[0] if iou else None))
+        return levels, scores
 
-    def candidates(self, levels: list[Tensor], logits: list[Tensor]) -> list[list[Candidates]]:
+    def candidates(self, levels: list[Tensor], scores: list[Tensor]) -> list[list[Candidates]]:
         """For every sample and class the best anchors above the threshold, regressed and decoded."""
         return [
-            [self._candidates(label, b, levels, of_class[b]) for label, of_class in enumerate(logits)]
-            for b in range(len(logits[0]))
+            [self._candidates(label, b, levels, of_class[b]) for label, of_class in enumerate(scores)]
+            for b in range(len(scores[0]))
         ]
 
-    def _candidates(self, label: int, b: int, levels: list[Tensor], logits: Tensor) -> Candidates:
+    def _candidates(self, label: int, b: int, levels: list[Tensor], scores: Tensor) -> Candidates:
         head, entry = self.config.head, self.entries[label]
         if self.device.type == "cpu":
-            at = (logits.sigmoid() > head.score_threshold).nonzero().squeeze(1)
-            at = at[torch.sort(logits[at], descending=True, stable=True).indices[: head.candidates]]
+            at = (scores > head.score_threshold).nonzero().squeeze(1)
+            at = at[torch.sort(scores[at], descending=True, stable=True).indices[: head.candidates]]
         else:  # as many for every cloud, so that no length is read from the device
-            at = torch.sort(logits, descending=True, stable=True).indices[: head.candidates]
-        scores = logits[at].sigmoid()
+            at = torch.sort(scores, descending=True, stable=True).indices[: head.candidates]
+        scores = scores[at]
         values = regress(levels[entry.level][b], at, self.regression_weights[label], anchors_per_cell(entry))
-        direction = values[:, 10:].argmax(dim=1) if head.direction else None
-        boxes = decode(values[:, :8], values[:, 8:10], direction, self.anchors[label][at])
+        count = LOCATION_VALUES[head.regression]
+        direction = values[:, count + 2 :].argmax(dim=1) if head.direction else None
+        boxes = decode(values[:, :count], values[:, count : count + 2], direction, self.anchors[label][at])
         return Candidates(boxes, scores, scores > head.score_threshold)
 
     def suppress(self, candidates: list[list[Candidates]]) -> list[Detections]:
@@ -201,8 +210,8 @@ def fold_batch_norms(module: nn.Module) -> nn.Module:
 
 
 def regression_weight(head: Head) -> Tensor:
-    """All branches of a head but the score as one matrix (9 C + 1, N_anc * values): 3 x 3 cells, then the bias."""
-    branches = [branch for branch in (head.corners, head.vertical, head.direction) if branch is not None]
+    """The branches of a head that regress as one matrix (9 C + 1, N_anc * values): 3 x 3 cells, then the bias."""
+    branches = [branch for branch in (head.location, head.vertical, head.direction) if branch is not None]
     anchors = head.score.weight.shape[0]
     parts = []
     for branch in branches:

@@ -19,8 +19,9 @@ from hvnet.kernels.encode import (
     voxel_means,
     write_image,
 )
-from hvnet.kernels.scatter import Segments, segment_add, segment_mean
+from hvnet.kernels.scatter import Segments, segment_add, segment_max, segment_mean
 from hvnet.kernels.voxel import Grid, Voxels, is_nested, make_grid, nested_index, voxel_index
+from hvnet.pillars import PillarEncoder, hard_voxels
 from hvnet.ranks import joined, size
 
 POINT_CHANNELS = 4  # d: x, y, z, reflectance
@@ -32,10 +33,8 @@ def pyramid_depth(config: EncoderConfig) -> int:
 
 
 def projection_grids(config: EncoderConfig) -> list[Grid]:
-    """The grids of S_R, finest first; the finest is padded so that every block of the backbone halves it evenly."""
-    finest = make_grid(
-        config.point_range, config.voxel_size, config.projection_scales[0], 2 ** (pyramid_depth(config) - 1)
-    )
+    """The grids of S_R, finest first; the finest is padded so that every block of the backbone may halve it evenly."""
+    finest = make_grid(config.point_range, config.voxel_size, config.projection_scales[0], 2 ** pyramid_depth(config))
     grids = [finest]
     for _ in config.projection_scales[1:]:
         last = grids[-1]
@@ -129,11 +128,34 @@ class AttentiveVFE(nn.Module):
         return [attend(features, points, scale.mean, layer, scale.segments, self.relu, keep) for scale in voxels]
 
 
+class VFE(nn.Module):
+    """VoxelNet's layer (Zhou and Tuzel, CVPR 2018) in the place of AttentiveVFE: M = ReLU(BN(Linear([features, g]))).
+
+    The batch norm takes its statistics over all scales at once, as that of the attentive layer.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int) -> None:
+        super().__init__()
+        self.features = nn.Linear(in_channels, out_channels, bias=False)  # the two halves of one Linear
+        self.knowledge = nn.Linear(2 * POINT_CHANNELS, out_channels, bias=False)
+        self.norm = nn.BatchNorm1d(out_channels)
+
+    def forward(self, features: Tensor, points: Tensor, voxels: list[ScaleOfPoints]) -> list[tuple[Tensor, Tensor]]:
+        """Linear(features) (N, q) and points (N, d) to M (N, q) and its maxima (V, q) in the voxels of every scale."""
+        given = [knowledge(points, at.mean, at.segments.voxel)[:, :-1] for at in voxels]
+        rows = [features + self.knowledge(g) for g in given]
+        scale, shift = batch_norm(self.norm, torch.cat(rows))
+        products = [torch.relu(each * scale + shift) for each in rows]
+        return [(each, segment_max(each, at.segments)[0]) for each, at in zip(products, voxels, strict=True)]
+
+
 class HybridVoxelEncoder(nn.Module):
     """HVFE: points are encoded in the voxels of every feature scale and projected into every projection scale."""
 
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
+        self.limits = (config.point_limit, config.voxel_limit)
+        self.limited_grid = make_grid(config.point_range, config.voxel_size, 1.0)
         self.projection_grids = projection_grids(config)
         shared = dict(zip(config.projection_scales, self.projection_grids, strict=True))
         self.feature_grids = [
@@ -141,14 +163,21 @@ class HybridVoxelEncoder(nn.Module):
             for scale in config.feature_scales
         ]
         channels = config.feature_channels
-        self.avfe = AttentiveVFE(POINT_CHANNELS, channels, config.attention_relu)
-        self.avfeo = AttentiveVFE(
-            2 * channels * len(config.feature_scales), config.image_channels, config.attention_relu
-        )
+        context = 2 * channels * len(config.feature_scales)
+        self.avfe: AttentiveVFE | VFE
+        self.avfeo: AttentiveVFE | VFE
+        if config.vfe == "plain":
+            self.avfe, self.avfeo = VFE(POINT_CHANNELS, channels), VFE(context, config.image_channels)
+        else:
+            self.avfe = AttentiveVFE(POINT_CHANNELS, channels, config.attention_relu)
+            self.avfeo = AttentiveVFE(context, config.image_channels, config.attention_relu)
 
     def forward(self, points: Tensor, sample: Tensor, batch_size: int) -> list[Tensor]:
         """Points (N, 4) of samples (N,) to the images I^{s_r} (B, N_H, N_L, N_W), channels-last, finest first."""
         grids = list(dict.fromkeys(self.feature_grids + self.projection_grids))
+        if self.limits[0]:
+            kept = hard_voxels(points, sample, batch_size, self.limited_grid, *self.limits).point
+            points, sample = points[kept], sample[kept]
         index = voxel_index(points, sample, batch_size, grids)
         points = points[index.order]
         scales = {grid: scale_of_points(points, voxels) for grid, voxels in zip(grids, index.scales, strict=True)}
@@ -161,21 +190,28 @@ class HybridVoxelEncoder(nn.Module):
 
     def point_features(self, points: Tensor, scales: dict[Grid, ScaleOfPoints]) -> list[tuple[Tensor, Tensor]]:
         """AVFE: points (N, d) to M (N, q) and G' (V, q) of every feature scale."""
+        at = [scales[grid] for grid in self.feature_grids]
+        if isinstance(self.avfe, VFE):
+            return self.avfe(self.avfe.features(points), points, at)
         ones = torch.ones_like(points[:, :1])
         training = has_variance(self.training, points)
         of_rows = joined(moments(torch.cat((points, ones), dim=1))) if training else None
         weight = folded(self.avfe.features, self.avfe.features_norm, of_rows)
         features = torch.addmm(weight[-1], points, weight[:-1])
         as_it_is = torch.vstack((torch.ones_like(weight[-1]), torch.zeros_like(weight[-1])))
-        return self.avfe(features, as_it_is, points, [scales[grid] for grid in self.feature_grids], keep=True)
+        return self.avfe(features, as_it_is, points, at, keep=True)
 
     def voxel_features(
         self, encoded: list[tuple[Tensor, Tensor]], points: Tensor, scales: dict[Grid, ScaleOfPoints]
     ) -> list[Tensor]:
         """AVFEO: M and G' of every feature scale to G' (V, N_H) of every projection scale."""
         context = self.linear_of_context(encoded, [scales[grid] for grid in self.feature_grids])
-        norm = batch_norm(self.avfeo.features_norm, context)
-        projected = self.avfeo(context, norm, points, [scales[grid] for grid in self.projection_grids], keep=False)
+        at = [scales[grid] for grid in self.projection_grids]
+        if isinstance(self.avfeo, VFE):
+            projected = self.avfeo(context, points, at)
+        else:
+            norm = batch_norm(self.avfeo.features_norm, context)
+            projected = self.avfeo(context, norm, points, at, keep=False)
         return [maxima for _, maxima in projected]
 
     def linear_of_context(self, encoded: list[tuple[Tensor, Tensor]], voxels: list[ScaleOfPoints]) -> Tensor:
@@ -216,10 +252,11 @@ class FusedEncoder:
     """Inference with the weights of an encoder: the same images, with batch norms folded and nothing kept for training.
 
     Where the scales nest, nothing is read back from a GPU: arrays have the size of the points and counts stay on the
-    device. The images are reused: they hold until the next call, which clears them.
+    device. The images are reused: they hold until the next call, which clears them. An encoder whose scales do not
+    nest, that has no attention or drops points, runs as it is.
     """
 
-    def __init__(self, encoder: HybridVoxelEncoder) -> None:
+    def __init__(self, encoder: HybridVoxelEncoder | PillarEncoder) -> None:
         self.encoder = encoder
         self.written: dict[tuple, tuple[Tensor, Scale]] = {}  # every image, and the voxels that were written last
 
@@ -228,13 +265,17 @@ class FusedEncoder:
         self, points: Tensor, sample: Tensor, batch_size: int, dtype: torch.dtype = torch.float32
     ) -> list[Tensor]:
         """As HybridVoxelEncoder in evaluation mode; the images are of the dtype, float32, float16 or bfloat16."""
-        encoder, avfe, avfeo = self.encoder, self.encoder.avfe, self.encoder.avfeo
-        grids = list(dict.fromkeys(encoder.feature_grids + encoder.projection_grids))
-        if not self.is_nested(batch_size):
+        encoder = self.encoder
+        if not self.is_fused(batch_size):
             training = encoder.training
             images = encoder.eval()(points, sample, batch_size)
             encoder.train(training)
             return [image.to(dtype) for image in images]
+        assert isinstance(encoder, HybridVoxelEncoder)
+        avfe, avfeo = encoder.avfe, encoder.avfeo
+        assert isinstance(avfe, AttentiveVFE)
+        assert isinstance(avfeo, AttentiveVFE)
+        grids = list(dict.fromkeys(encoder.feature_grids + encoder.projection_grids))
         index = nested_index(points, sample, grids)
         parts, kept, rows = scales_of(index)
         points = points[index.order[:rows]]
@@ -266,9 +307,12 @@ class FusedEncoder:
             images.append(image.view(batch_size, *grid.shape, -1).permute(0, 3, 1, 2))
         return images
 
-    def is_nested(self, batch_size: int) -> bool:
-        """Whether one sort serves all scales, so that nothing is read from the device."""
-        return is_nested(self.encoder.feature_grids + self.encoder.projection_grids, batch_size)
+    def is_fused(self, batch_size: int) -> bool:
+        """Whether one sort serves all scales of an attentive encoder, so that nothing is read from the device."""
+        encoder = self.encoder
+        if isinstance(encoder, PillarEncoder) or isinstance(encoder.avfe, VFE) or encoder.limits[0]:
+            return False
+        return is_nested(encoder.feature_grids + encoder.projection_grids, batch_size)
 
     def image(
         self, grid: Grid, scale: Scale, batch_size: int, channels: int, dtype: torch.dtype, device: torch.device

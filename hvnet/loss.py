@@ -1,4 +1,4 @@
-"""Losses (Sec. 3.5, Eq. 5): focal, corners, vertical, and the optional direction."""
+"""Losses (Sec. 3.5, Eq. 5): focal, location, vertical, the optional direction, and what the supplement tried."""
 
 import functools
 
@@ -6,7 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from hvnet.anchors import Targets
+from hvnet.anchors import Targets, decode
+from hvnet.boxes import bev_corners
 from hvnet.config import ClassConfig, LossConfig
 from hvnet.head import HeadMaps
 from hvnet.ranks import joined
@@ -25,12 +26,62 @@ def class_loss(maps: HeadMaps, targets: Targets, entry: ClassConfig, weights: Lo
     focal = focal_loss(maps.logits, targets.positive, targets.negative, entry.focal_alpha, entry.focal_gamma)
     at = targets.positive
     smooth_l1 = functools.partial(F.smooth_l1_loss, reduction="sum", beta=weights.beta)
+    location, vertical = maps.location[at], maps.vertical[at]
+    if weights.box == "smooth_l1":
+        box = smooth_l1(location, targets.location)
+    else:
+        overlap = iou_pairs(targets.boxes, decode(location, vertical, None, targets.anchors), weights.box == "giou")
+        box = (1 - overlap).sum()
     terms = {
         "classification": weights.classification * focal,
-        "localization": weights.localization * smooth_l1(maps.corners[at], targets.corners),
-        "vertical": weights.vertical * smooth_l1(maps.vertical[at], targets.vertical),
+        "localization": weights.localization * box,
+        "vertical": weights.vertical * smooth_l1(vertical, targets.vertical),
     }
     if maps.direction is not None:
         direction = F.cross_entropy(maps.direction[at], targets.direction, reduction="sum")
         terms["direction"] = weights.direction * direction
+    if maps.iou is not None:
+        with torch.no_grad():
+            overlap = iou_pairs(targets.boxes, decode(location, vertical, None, targets.anchors))
+        iou = F.binary_cross_entropy_with_logits(maps.iou[at], overlap, reduction="sum")
+        terms["iou"] = weights.iou * iou
     return {name: term / positives for name, term in terms.items()}
+
+
+def iou_pairs(a: Tensor, b: Tensor, generalized: bool = False) -> Tensor:
+    """BEV IoU (P,) of boxes a (P, 7) with boxes b (P, 7), with a gradient in both; generalized: GIoU, in [-1, 1].
+
+    The formula is that of `kernels/rotated.py` (Green's theorem in the frame of a). GIoU (Rezatofighi et al., CVPR
+    2019) subtracts what neither covers of the rectangle along a that encloses both.
+    """
+    corners = bev_corners(b.double()) - a[:, None, :2].double()  # (P, 4, 2)
+    cos, sin = a[:, 6, None].double().cos(), a[:, 6, None].double().sin()
+    x, y = corners[..., 0] * cos + corners[..., 1] * sin, corners[..., 1] * cos - corners[..., 0] * sin
+    half_l, half_w = a[:, 3, None].double() / 2, a[:, 4, None].double() / 2
+    # corners are clockwise, an area is positive the other way round: the edges go from a corner to the one before it
+    shared = _edge_areas(x, y, x.roll(1, 1), y.roll(1, 1), half_l, half_w).sum(dim=1).clamp(min=0)
+    union = (a[:, 3] * a[:, 4] + b[:, 3] * b[:, 4]).double() - shared
+    iou = shared / union
+    if generalized:
+        length = torch.maximum(x.amax(1), half_l[:, 0]) - torch.minimum(x.amin(1), -half_l[:, 0])
+        width = torch.maximum(y.amax(1), half_w[:, 0]) - torch.minimum(y.amin(1), -half_w[:, 0])
+        iou = iou - 1 + union / (length * width)
+    return iou.to(a.dtype)
+
+
+def _edge_areas(x0: Tensor, y0: Tensor, x1: Tensor, y1: Tensor, l: Tensor, w: Tensor) -> Tensor:
+    """The integrals of clamp(x, -l, l) dy along edges (x0, y0) to (x1, y1), all (P, 4), where |y| <= w."""
+    rise = y1 - y0
+    steep = rise.abs() > 1e-9
+    slope = torch.where(steep, (x1 - x0) / rise.where(steep, 1.0), 0.0)
+    low, high = torch.clamp(y0, -w, w), torch.clamp(y1, -w, w)
+    start, end = x0 + (low - y0) * slope, x1 - (y1 - high) * slope
+    span = end - start
+    long = span.abs() > 1e-6
+
+    def integral(x: Tensor) -> Tensor:
+        """Of clamp(t, -l, l) from 0 to x."""
+        return torch.where(x.abs() <= l, x.square() / 2, l * x.abs() - l.square() / 2)
+
+    mean = torch.where(long, (integral(end) - integral(start)) / span.where(long, 1.0), torch.clamp(start, -l, l))
+    return mean * (high - low)

@@ -1,6 +1,7 @@
 """HVNet: encoder, backbone and one head a class; `forward` returns maps, `detect` returns boxes."""
 
 import os
+import platform
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,11 +11,12 @@ from torch import Tensor, nn
 from hvnet.anchors import assign_targets, decode, make_anchors
 from hvnet.backbone import Backbone
 from hvnet.cli import InputError
-from hvnet.config import Config, config_from_dict
-from hvnet.encoder import HybridVoxelEncoder
-from hvnet.head import Head, HeadMaps
+from hvnet.config import Config, EncoderConfig, config_from_dict
+from hvnet.encoder import HybridVoxelEncoder, projection_grids
+from hvnet.head import Head, HeadMaps, scores_of
 from hvnet.kernels.rotated import rotated_nms
 from hvnet.loss import class_loss
+from hvnet.pillars import PillarEncoder
 
 
 class Detections(NamedTuple):
@@ -25,16 +27,31 @@ class Detections(NamedTuple):
     labels: Tensor  # (M,) int64, index into config.head.classes
 
 
+LOSS_TERMS = ("classification", "localization", "vertical", "direction", "iou")
+
+
+def make_encoder(config: EncoderConfig) -> HybridVoxelEncoder | PillarEncoder:
+    """The hybrid voxel encoder, or that of PointPillars."""
+    if config.vfe == "pillar":
+        grid = projection_grids(config)[0]
+        return PillarEncoder(grid, config.image_channels, config.point_limit, config.voxel_limit)
+    return HybridVoxelEncoder(config)
+
+
 class HVNet(nn.Module):
     """The detector. A batch is all points (N, 4) of all samples in one tensor, and the sample (N,) of each point."""
 
     def __init__(self, config: Config) -> None:
         super().__init__()
         self.config = config
-        self.encoder = HybridVoxelEncoder(config.encoder)
+        self.encoder = make_encoder(config.encoder)
         self.backbone = Backbone(config.backbone, config.encoder.image_channels, len(config.encoder.projection_scales))
-        channels = config.backbone.fusion_channels
-        self.heads = nn.ModuleList(Head(entry, channels, config.head.direction) for entry in config.head.classes)
+        self.heads = nn.ModuleList(Head(entry, self.backbone.channels, config.head) for entry in config.head.classes)
+        self.log_variances = nn.ParameterDict()
+        if config.loss.uncertainty:
+            for name in LOSS_TERMS:
+                if name not in ("direction", "iou") or getattr(config.head, name):
+                    self.log_variances[name] = nn.Parameter(torch.zeros(()))
         for k, entry in enumerate(config.head.classes):
             self.register_buffer(f"anchors_{k}", make_anchors(config, entry), persistent=False)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -55,13 +72,19 @@ class HVNet(nn.Module):
             return [head(levels[entry.level]) for head, entry in zip(self.heads, self.config.head.classes, strict=True)]
 
     def loss(self, maps: list[HeadMaps], boxes: list[Tensor], labels: list[Tensor]) -> dict[str, Tensor]:
-        """Eq. 5: the terms summed over classes, for the boxes (M_b, 7) and labels (M_b,) of every sample."""
+        """Eq. 5: the terms summed over classes, for the boxes (M_b, 7) and labels (M_b,) of every sample.
+
+        With learnt weights a term L is exp(-s) L + s, s the logarithm of its variance (Kendall et al., CVPR 2018).
+        """
         total: dict[str, Tensor] = {}
         for k, entry in enumerate(self.config.head.classes):
             own = [b[at == k] for b, at in zip(boxes, labels, strict=True)]
-            targets = assign_targets(self.anchors(k), own, entry.positive_iou, entry.negative_iou)
+            thresholds = entry.positive_iou, entry.negative_iou
+            targets = assign_targets(self.anchors(k), own, *thresholds, self.config.head.regression)
             for name, term in class_loss(maps[k], targets, entry, self.config.loss).items():
                 total[name] = total[name] + term if name in total else term
+        for name, s in self.log_variances.items():
+            total[name] = (-s).exp() * total[name] + s
         return total
 
     @torch.no_grad()
@@ -81,12 +104,12 @@ class HVNet(nn.Module):
 
     def _detect_class(self, label: int, maps: HeadMaps) -> Detections:
         head = self.config.head
-        scores = maps.logits.sigmoid()
+        scores = scores_of(maps.logits, maps.iou)
         at = (scores > head.score_threshold).nonzero().squeeze(1)
         best = torch.sort(scores[at], descending=True, stable=True).indices[: head.candidates]
         at = at[best]
         direction = None if maps.direction is None else maps.direction[at].argmax(dim=1)
-        boxes = decode(maps.corners[at], maps.vertical[at], direction, self.anchors(label)[at])
+        boxes = decode(maps.location[at], maps.vertical[at], direction, self.anchors(label)[at])
         kept = rotated_nms(boxes, scores[at], head.classes[label].nms_iou)[: head.detections]
         return Detections(boxes[kept], scores[at][kept], torch.full_like(kept, label))
 
@@ -145,3 +168,13 @@ def select_device(name: str) -> torch.device:
         return torch.device(name)
     except RuntimeError as error:
         raise InputError(f"--device {name}: want auto, cpu, cuda or cuda:N") from error
+
+
+def device_name(device: torch.device) -> str:
+    """What a device is called: the GPU's or the processor's name."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

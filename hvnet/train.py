@@ -339,6 +339,8 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
     batch_size = config.train.batch_size
     if batch_size % ranks.size():
         raise InputError(f"train.batch_size: want a multiple of the {ranks.size()} ranks, got {batch_size}")
+    if config.loss.uncertainty and ranks.size() > 1:
+        raise InputError("loss.uncertainty: is for one process; start without torchrun")
     train_ids = read_split(root, config.train.train_split)
     val_ids = read_split(root, config.train.val_split)
     frames = hashlib.sha256(json.dumps([train_ids, val_ids]).encode()).hexdigest()
@@ -581,6 +583,15 @@ def keep_metrics(path: Path, epochs: int) -> None:
             partial.replace(path)
 
 
+def generated_scenes(config: Config, folder: Path) -> Path:
+    """A KITTI root in the folder, of the scenes that the config asks for; what is there already is taken."""
+    assert config.synthetic is not None
+    scenes, reach, seed = config.synthetic, config.encoder.point_range[3], config.train.seed
+    root = folder / f"scenes-{scenes.train_frames}-{scenes.val_frames}-{reach:g}m-{seed}"
+    generate(root, scenes.train_frames, scenes.val_frames, seed, Options(distance=(4.0, min(reach - 2, 80.0))))
+    return root
+
+
 def choose_out(given: str | None, config: Path, resume: bool) -> Path:
     """The run's folder: the one given, or runs/NAME, runs/NAME-2, ... after the config."""
     if given is not None:
@@ -635,12 +646,7 @@ def main(arguments: Sequence[str] | None) -> None:
     if root is None:
         if config.synthetic is None:
             raise InputError(f"{options.config}: has no key synthetic, so it needs --data with a KITTI root")
-        scenes, reach = config.synthetic, config.encoder.point_range[3]
-        root = out.parent / f"scenes-{scenes.train_frames}-{scenes.val_frames}-{reach:g}m-{config.train.seed}"
-        if ranks.rank() == 0:
-            distance = (4.0, min(reach - 2, 80.0))
-            generate(root, scenes.train_frames, scenes.val_frames, config.train.seed, Options(distance=distance))
-        ranks.of_first(None)  # the others wait for the scenes
+        root = ranks.of_first(generated_scenes(config, out.parent) if ranks.rank() == 0 else None)
     with caught_signals() as signals:
         train(config, root, out, device, options.resume, signals)
     ranks.stop()  # not after an error: the others are still at work, and torchrun ends them

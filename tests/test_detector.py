@@ -37,7 +37,7 @@ def lively(config: Config, seed: int = 0, **head: object) -> HVNet:
     torch.manual_seed(seed)
     model = HVNet(dataclasses.replace(config, head=dataclasses.replace(config.head, **head)))
     for each in model.heads:
-        for branch in (each.score, each.corners, each.vertical):
+        for branch in (each.score, each.location, each.vertical):
             torch.nn.init.normal_(branch.weight, std=0.05)
     for module in model.modules():
         if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
@@ -114,14 +114,38 @@ def test_folded_convolutions_give_the_same_maps(demo: Config) -> None:
 def test_regression_of_chosen_anchors_equals_the_convolutions(demo: Config) -> None:
     """Every anchor of a map that is not square, its borders included."""
     torch.manual_seed(0)
-    head = Head(dataclasses.replace(demo.head.classes[0], anchor_sizes=((3.9, 1.6, 1.5), (8.0, 2.5, 3.0))), 6, True)
+    head = Head(
+        dataclasses.replace(demo.head.classes[0], anchor_sizes=((3.9, 1.6, 1.5), (8.0, 2.5, 3.0))), 6, demo.head
+    )
     level = torch.randn(1, 6, 5, 3)
     maps = head(level)
     assert maps.direction is not None
-    want = torch.cat((maps.corners[0], maps.vertical[0], maps.direction[0]), dim=1)
+    want = torch.cat((maps.location[0], maps.vertical[0], maps.direction[0]), dim=1)
     at = torch.randperm(5 * 3 * 8)
     found = regress(level[0], at, regression_weight(head), 8)
     torch.testing.assert_close(found, want[at], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"head.regression": "pose"},
+        {"head.iou": "true"},
+        {"head.iou": "true", "head.direction": "false", "head.regression": "pose"},
+        {"encoder.vfe": "plain"},
+        {"encoder.point_limit": "1"},
+        {"backbone.pyramid": "fpn"},
+    ],
+    ids=str,
+)
+def test_every_switch_detects_as_the_plain_model(changes: dict[str, str]) -> None:
+    config = load_config(CONFIGS / "demo.yaml", [*NARROW, *(f"{key}={value}" for key, value in changes.items())])
+    model = lively(config, score_threshold=0.02)
+    points = some_points()
+    want = model.detect(points, torch.zeros(500, dtype=torch.int64), 1)[0]
+    found = Detector(model, CPU, torch.float32)(points)
+    assert len(want.boxes) > 5
+    same(found, want)
 
 
 def test_training_does_not_change_a_detector(demo: Config) -> None:

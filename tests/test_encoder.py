@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hvnet.config import EncoderConfig
 from hvnet.data.kitti import read_frame
-from hvnet.encoder import AttentiveVFE, FusedEncoder, HybridVoxelEncoder, projection_grids
+from hvnet.encoder import VFE, AttentiveVFE, FusedEncoder, HybridVoxelEncoder, projection_grids
 from hvnet.kernels import reference
 from hvnet.kernels.voxel import Grid
 
@@ -38,7 +38,11 @@ def plain_norm(norm: torch.nn.BatchNorm1d, rows: Tensor, training: bool) -> Tens
     return (rows - mean) / (var + norm.eps).sqrt() * norm.weight.double() + norm.bias.double()
 
 
-def plain_vfe(layer: AttentiveVFE, features: Tensor, knowledge: list[Tensor], training: bool) -> list[Tensor]:
+def plain_vfe(layer: AttentiveVFE | VFE, features: Tensor, knowledge: list[Tensor], training: bool) -> list[Tensor]:
+    if isinstance(layer, VFE):
+        weight = torch.cat((layer.features.weight, layer.knowledge.weight), dim=1).double()
+        rows = torch.cat([torch.cat((features, g), dim=1) for g in knowledge]) @ weight.T
+        return list(plain_norm(layer.norm, rows, training).relu().chunk(len(knowledge)))
     weighed = plain_norm(layer.features_norm, features @ layer.features.weight.double().T, training)
     attention = plain_norm(layer.knowledge_norm, torch.cat(knowledge) @ layer.knowledge.weight.double().T, training)
     if layer.relu:
@@ -78,6 +82,17 @@ def plain_encoder(
     return images
 
 
+def restless(encoder: HybridVoxelEncoder) -> HybridVoxelEncoder:
+    """With running statistics and weights that are not those of the start."""
+    for module in encoder.modules():
+        if isinstance(module, torch.nn.BatchNorm1d):
+            module.running_mean.normal_()
+            module.running_var.uniform_(0.5, 2)
+            torch.nn.init.normal_(module.weight)
+            torch.nn.init.normal_(module.bias)
+    return encoder
+
+
 SCALES = [
     ((0.5, 1.0, 2.0), (1.0, 2.0, 4.0)),
     ((1.0,), (1.0,)),
@@ -97,14 +112,7 @@ def test_encoder_is_the_papers(
     config = dataclasses.replace(
         SMALL, feature_scales=feature_scales, projection_scales=projection_scales, attention_relu=relu
     )
-    encoder = HybridVoxelEncoder(config)
-    for module in encoder.modules():  # running statistics and weights that are not those of the start
-        if isinstance(module, torch.nn.BatchNorm1d):
-            module.running_mean.normal_()
-            module.running_var.uniform_(0.5, 2)
-            torch.nn.init.normal_(module.weight)
-            torch.nn.init.normal_(module.bias)
-    encoder.train(training)
+    encoder = restless(HybridVoxelEncoder(config)).train(training)
     points, sample = cloud(400)
     expected = plain_encoder(encoder, points, sample, 2, training)
     images = encoder(points, sample, 2)
@@ -324,3 +332,53 @@ def test_memory_goes_by_points_not_by_cells() -> None:
     # 120,000 points of 192 + 128 channels are 154 MB, in training several times over; the images 60 MB
     assert inference < 600
     assert training < 900
+
+
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize(("feature_scales", "projection_scales"), SCALES[:3])
+def test_without_attention(
+    feature_scales: tuple[float, ...], projection_scales: tuple[float, ...], training: bool
+) -> None:
+    """VoxelNet's VFE layers against a plain float64 writing, values and gradients; inference takes the same way."""
+    torch.manual_seed(2)
+    config = dataclasses.replace(SMALL, vfe="plain", feature_scales=feature_scales, projection_scales=projection_scales)
+    encoder = restless(HybridVoxelEncoder(config)).train(training)
+    points, sample = cloud(400)
+    expected = plain_encoder(encoder, points, sample, 2, training)
+    before = copy.deepcopy(encoder)
+    images = encoder(points, sample, 2)
+    weights = [torch.randn(image.shape) for image in images]
+    for own, other in zip(images, expected, strict=True):
+        torch.testing.assert_close(own.double(), other, rtol=1e-4, atol=1e-4)
+    parameters = list(encoder.parameters())
+    own = torch.autograd.grad(sum((i * w).sum() for i, w in zip(images, weights, strict=True)), parameters)
+    other = torch.autograd.grad(sum((i * w).sum() for i, w in zip(expected, weights, strict=True)), parameters)
+    for a, b in zip(own, other, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3 * float(b.abs().max()))
+    if not training:
+        for own, other in zip(FusedEncoder(before)(points, sample, 2), images, strict=True):
+            assert torch.equal(own, other)
+
+
+@pytest.mark.parametrize("vfe", ["attentive", "plain"])
+def test_hard_voxels_drop_points_before_the_encoder(vfe: str) -> None:
+    """At most 2 points of a voxel of 0.4 m, and 40 voxels a sample: the encoder sees the others only."""
+    config = dataclasses.replace(SMALL, vfe=vfe)
+    torch.manual_seed(3)
+    whole = restless(HybridVoxelEncoder(config)).eval()
+    limited = HybridVoxelEncoder(dataclasses.replace(config, point_limit=2, voxel_limit=40)).eval()
+    limited.load_state_dict(whole.state_dict())
+    points, sample = cloud(600)
+    cursor = reference.cursors(points, sample, whole.projection_grids[0])
+    voxels: list[dict[int, int]] = [{}, {}]
+    kept = []
+    for k, (at, b) in enumerate(zip(cursor.tolist(), sample.tolist(), strict=True)):
+        of_sample = voxels[b]
+        if at >= 0 and (at in of_sample or len(of_sample) < 40):
+            of_sample[at] = of_sample.get(at, 0) + 1
+            kept += [k] if of_sample[at] <= 2 else []
+    assert 80 < len(kept) < 160
+    expected = whole(points[kept], sample[kept], 2)
+    for run in (limited, FusedEncoder(limited)):
+        for own, other in zip(run(points, sample, 2), expected, strict=True):
+            torch.testing.assert_close(own, other, rtol=1e-5, atol=1e-5)

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from hvnet.anchors import assign_targets, decode, encode, make_anchors
+from hvnet.backbone import FPN, Backbone
 from hvnet.boxes import bev_corners
-from hvnet.config import Config, LossConfig, load_config
+from hvnet.config import BackboneConfig, Config, LossConfig, load_config
 from hvnet.head import HeadMaps, anchor_rows
 from hvnet.kernels import reference
 from hvnet.loss import class_loss, focal_loss
@@ -46,14 +47,14 @@ def test_shapes_of_every_stage(demo: Config) -> None:
     assert [i.shape for i in images] == [(2, 32, 32, 16), (2, 32, 16, 8), (2, 32, 8, 4)]
     stream = model.backbone.main_stream(images)
     assert [b.shape for b in stream] == [(2, 16, 32, 16), (2, 32, 16, 8), (2, 64, 8, 4)]
-    levels = model.backbone.ffpn(stream)
+    levels = model.backbone.pyramid(stream)
     assert [level.shape for level in levels] == [(2, 32, 32, 16), (2, 32, 16, 8), (2, 32, 8, 4)]
     maps = model(points, sample, 2)
     for k, (of_class, entry) in enumerate(zip(maps, demo.head.classes, strict=True)):
         anchors = 4 * (32 >> entry.level) * (16 >> entry.level)
         assert model.anchors(k).shape == (anchors, 7)
         assert of_class.logits.shape == (2, anchors)
-        assert of_class.corners.shape == (2, anchors, 8)
+        assert of_class.location.shape == (2, anchors, 8)
         assert of_class.vertical.shape == (2, anchors, 2)
         assert of_class.direction is not None
         assert of_class.direction.shape == (2, anchors, 2)
@@ -118,6 +119,27 @@ def test_papers_numbers() -> None:
     assert augment.objects == {"Car": 15, "Pedestrian": 8, "Cyclist": 8}
 
 
+@pytest.mark.parametrize(("pyramid", "levels"), [("none", 3), ("fpn", 3), ("ffpn", 3), ("upsampled", 1)])
+@pytest.mark.parametrize("stride", [1, 2])
+def test_pyramids(pyramid: str, levels: int, stride: int) -> None:
+    config = BackboneConfig((8, 12, 16), (2, 2, 2), stride, pyramid, 10)  # type: ignore[arg-type]
+    backbone = Backbone(config, 6, 1)
+    maps = backbone([torch.randn(2, 6, 32, 16)])
+    n_l, n_w = 32 // stride, 16 // stride
+    assert [m.shape for m in maps] == [(2, backbone.channels, n_l >> k, n_w >> k) for k in range(levels)]
+
+
+def test_fpn_adds_the_coarser_levels() -> None:
+    """Lateral maps of ones and no smoothing: each level has one more than the level above it."""
+    fpn = FPN((1, 1, 1), 1)
+    for lateral in fpn.lateral:
+        torch.nn.init.ones_(lateral.weight)
+        torch.nn.init.zeros_(lateral.bias)
+    fpn.smooth = torch.nn.ModuleList(torch.nn.Identity() for _ in range(3))
+    levels = fpn([torch.ones(1, 1, 8, 4), torch.ones(1, 1, 4, 2), torch.ones(1, 1, 2, 1)])
+    assert [level.unique().tolist() for level in levels] == [[3], [2], [1]]
+
+
 def test_anchors_stand_at_cell_centres(demo: Config) -> None:
     entry = demo.head.classes[0]
     anchors = make_anchors(demo, entry)
@@ -151,6 +173,22 @@ def test_decode_is_the_inverse_of_encode() -> None:
     assert ((decoded[:, 6] >= -math.pi) & (decoded[:, 6] < math.pi)).all()
 
 
+def test_pose_is_inverted_and_by_hand() -> None:
+    """VoxelNet's residuals, of the half-turn that is nearer to the anchor."""
+    boxes, anchors = random_boxes(10_000).double(), random_boxes(10_000, seed=1).double()
+    location, vertical, direction = encode(boxes, anchors, "pose")
+    assert location.shape == (10_000, 5)
+    assert (location[:, 4].abs() <= math.pi / 2 + 1e-9).all()
+    decoded = decode(location, vertical, direction, anchors)
+    torch.testing.assert_close(decoded[:, :6], boxes[:, :6], rtol=0, atol=1e-9)
+    assert (torch.cos(decoded[:, 6] - boxes[:, 6]) > 1 - 1e-9).all()
+    anchor = torch.tensor([[10.0, 0.0, -1.0, 4.0, 3.0, 1.5, 0.0]])
+    box = torch.tensor([[11.0, 0.5, -1.0, 8.0, 3.0, 1.5, math.pi - 0.2]])
+    location, _, direction = encode(box, anchor, "pose")
+    torch.testing.assert_close(location, torch.tensor([[0.2, 0.1, math.log(2), 0.0, -0.2]]))
+    assert direction.tolist() == [1]
+
+
 def test_encode_by_hand() -> None:
     anchor = torch.tensor([[10.0, 0.0, -1.0, 4.0, 2.0, 1.5, 0.0]])
     box = torch.tensor([[11.0, 0.5, -0.7, 4.0, 2.0, 3.0, math.pi]])  # backwards: its front is the anchor's rear
@@ -168,7 +206,7 @@ def test_assign_targets_by_hand() -> None:
     targets = assign_targets(anchors, [boxes, boxes[:0]], 0.75, 0.6)
     assert targets.positive.tolist() == [[True, False, False, True, False], [False] * 5]
     assert targets.negative.tolist() == [[False, False, True, False, True], [True] * 5]
-    torch.testing.assert_close(targets.corners, torch.tensor([[0.4, 0.0] * 4, [3.9, 0.0] * 4]))
+    torch.testing.assert_close(targets.location, torch.tensor([[0.4, 0.0] * 4, [3.9, 0.0] * 4]))
 
 
 def test_two_boxes_with_one_best_anchor() -> None:
@@ -176,7 +214,7 @@ def test_two_boxes_with_one_best_anchor() -> None:
     boxes = torch.tensor([[1.0, 0, 0, 4, 2, 1.5, 0], [0.5, 0, 0, 4, 2, 1.5, 0]])
     targets = assign_targets(anchors, [boxes], 0.9, 0.3)
     assert targets.positive.tolist() == [[True, False]]
-    torch.testing.assert_close(targets.corners, torch.tensor([[1.0, 0.0] * 4]))
+    torch.testing.assert_close(targets.location, torch.tensor([[1.0, 0.0] * 4]))
 
 
 def test_assign_targets_is_the_matrix_version(demo: Config) -> None:
@@ -256,7 +294,7 @@ def mirror(model: HVNet) -> HVNet:
             layer.knowledge.weight[:, [1, 5]] *= -1  # y - mean y and mean y of Eq. 2
         for head in image.heads:
             mirror_channels(head.score, 1)
-            mirror_channels(head.corners, 8)
+            mirror_channels(head.location, 8)
             mirror_channels(head.vertical, 2)
             if head.direction is not None:
                 mirror_channels(head.direction, 2, is_direction=True)
@@ -340,4 +378,4 @@ def test_batch_of_samples_is_each_alone(demo: Config) -> None:
             alone = model(own, torch.zeros(len(own), dtype=torch.int64), 1)
             for a, t in zip(alone, together, strict=True):
                 torch.testing.assert_close(a.logits[0], t.logits[b], rtol=1e-4, atol=1e-4)
-                torch.testing.assert_close(a.corners[0], t.corners[b], rtol=1e-4, atol=1e-4)
+                torch.testing.assert_close(a.location[0], t.location[b], rtol=1e-4, atol=1e-4)

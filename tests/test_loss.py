@@ -1,0 +1,94 @@
+"""IoU and GIoU of pairs of boxes with a gradient; learnt weights."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from hvnet.config import load_config
+from hvnet.kernels.rotated import rotated_iou_bev
+from hvnet.loss import iou_pairs
+from hvnet.model import HVNet
+from tests.test_config import CONFIGS
+
+
+def box(x: float, y: float, l: float, w: float, yaw: float = 0.0) -> Tensor:
+    return torch.tensor([[x, y, 0.0, l, w, 1.5, yaw]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("other", "iou", "giou"),
+    [
+        (box(0, 0, 4, 2), 1.0, 1.0),
+        (box(0, 0, 4, 2, math.pi), 1.0, 1.0),
+        (box(2, 0, 4, 2), 1 / 3, 1 / 3),  # the enclosing rectangle is the union
+        (box(2, 1, 4, 2), 2 / 14, 2 / 14 - (18 - 14) / 18),
+        (box(0, 0, 2, 4), 4 / 12, 4 / 12 - (16 - 12) / 16),
+        (box(0, 0, 4, 2, math.pi / 2), 4 / 12, 4 / 12 - (16 - 12) / 16),
+        (box(0, 0, 2, 1), 1 / 4, 1 / 4),
+        (box(6, 0, 4, 2), 0.0, -(20 - 16) / 20),
+        (box(0, 0, math.sqrt(2), math.sqrt(2), math.pi / 4), 2 / 8, 2 / 8),
+    ],
+)
+def test_iou_by_hand(other: Tensor, iou: float, giou: float) -> None:
+    one = box(0, 0, 4, 2)
+    assert iou_pairs(one, other).item() == pytest.approx(iou, abs=1e-9)
+    assert iou_pairs(one, other, generalized=True).item() == pytest.approx(giou, abs=1e-9)
+    assert iou_pairs(other, one).item() == pytest.approx(iou, abs=1e-9)
+
+
+def pairs(count: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    a, b = torch.rand(2, count, 7, generator=generator, dtype=torch.float64)
+    for boxes in (a, b):
+        boxes[:, 3:6] += 0.5
+        boxes[:, 6] = (boxes[:, 6] - 0.5) * 2 * math.pi
+    return a, b
+
+
+def test_iou_is_that_of_the_kernel() -> None:
+    a, b = pairs(500)
+    expected = rotated_iou_bev(a, b).diagonal()
+    torch.testing.assert_close(iou_pairs(a, b), expected, rtol=0, atol=1e-9)
+    torch.testing.assert_close(iou_pairs(a.float(), b.float()), expected.float(), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("generalized", [False, True])
+def test_gradient(generalized: bool) -> None:
+    a, b = (boxes.requires_grad_() for boxes in pairs(40))
+    assert torch.autograd.gradcheck(lambda a, b: iou_pairs(a, b, generalized), (a, b), atol=1e-6)
+
+
+def test_gradients_of_equal_and_of_distant_boxes_are_finite() -> None:
+    for other in (box(0, 0, 4, 2), box(50, 0, 4, 2), box(0, 0, 4, 2, math.pi / 2)):
+        moved = other.clone().requires_grad_()
+        iou_pairs(box(0, 0, 4, 2), moved, generalized=True).sum().backward()
+        assert moved.grad is not None
+        assert moved.grad.isfinite().all()
+
+
+def test_learnt_weights_by_hand() -> None:
+    """L exp(-s) + s for every term, with one s a term."""
+    config = load_config(CONFIGS / "demo.yaml", ["encoder.point_range=[0, -3.2, -3, 12.8, 3.2, 2]"])
+    learnt = dataclasses.replace(config, loss=dataclasses.replace(config.loss, uncertainty=True))
+    torch.manual_seed(0)
+    plain = HVNet(config)
+    model = HVNet(learnt)
+    model.load_state_dict(plain.state_dict(), strict=False)
+    assert set(model.log_variances) == {"classification", "localization", "vertical", "direction"}
+    points, sample = torch.rand(300, 4) * 6, torch.zeros(300, dtype=torch.int64)
+    boxes, labels = [torch.tensor([[4.0, 0.0, -1.0, 3.9, 1.6, 1.5, 0.0]])], [torch.tensor([0])]
+    with torch.no_grad():
+        for k, name in enumerate(model.log_variances):
+            model.log_variances[name].fill_(0.5 * k)
+    terms = plain.loss(plain(points, sample, 1), boxes, labels)
+    weighed = model.loss(model(points, sample, 1), boxes, labels)
+    for k, name in enumerate(model.log_variances):
+        assert weighed[name].item() == pytest.approx(math.exp(-0.5 * k) * terms[name].item() + 0.5 * k, rel=1e-5)
+    torch.stack(list(weighed.values())).sum().backward()
+    for k, name in enumerate(model.log_variances):
+        s = model.log_variances[name]
+        assert s.grad is not None
+        assert s.grad.item() == pytest.approx(1 - math.exp(-0.5 * k) * terms[name].item(), rel=1e-4)
