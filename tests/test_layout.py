@@ -20,7 +20,7 @@ KERNELS = {
     "reference": set(),
 }
 ANY_KERNEL = {f"kernels.{name}" for name in KERNELS}
-NETWORK = {"config", "boxes", "anchors", "encoder", "backbone", "head", "loss"}
+NETWORK = {"config", "boxes", "anchors", "encoder", "pillars", "backbone", "head", "loss"}
 DATA = {"data.kitti", "data.clouds", "data.database", "data.augment", "data.synthetic", "data.shapes"}
 ALLOWED = {f"kernels.{name}": allowed for name, allowed in KERNELS.items()} | {
     "__init__": {"detector"},
@@ -28,11 +28,12 @@ ALLOWED = {f"kernels.{name}": allowed for name, allowed in KERNELS.items()} | {
     "boxes": set(),
     "config": set(),
     "ranks": set(),
-    "encoder": ANY_KERNEL | {"config", "ranks"},
+    "pillars": ANY_KERNEL,
+    "encoder": ANY_KERNEL | {"config", "pillars", "ranks"},
     "backbone": {"config", "ranks"},
     "anchors": ANY_KERNEL | {"config", "boxes", "encoder"},
     "head": {"config", "anchors"},
-    "loss": {"config", "anchors", "head", "ranks"},
+    "loss": {"config", "anchors", "boxes", "head", "ranks"},
     "model": ANY_KERNEL | NETWORK,
     "detector": ANY_KERNEL | NETWORK | {"model"},
     "data.__init__": set(),
@@ -49,6 +50,7 @@ ALLOWED = {f"kernels.{name}": allowed for name, allowed in KERNELS.items()} | {
     "weights.__main__": {"data.database", "model", "train"},
     "train": NETWORK | DATA | {"model", "detector", "draw", "evaluate", "ranks"},
     "detect": NETWORK | DATA | {"model", "detector", "draw", "evaluate"},
+    "study": ANY_KERNEL | NETWORK | DATA | {"model", "detector", "evaluate", "train"},
 }
 
 
