@@ -1,11 +1,28 @@
-"""What every command shares: the error a user can mend, and how it ends a command."""
+"""What every command shares: its parser, the error a user can mend, and how it ends."""
 
+import argparse
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 
 
 class InputError(ValueError):
     """A mistake in what the user gave; the message names the file, the place and the remedy."""
+
+
+def make_parser(command: str, description: str, examples: Sequence[str]) -> argparse.ArgumentParser:
+    """The parser of `python -m hvnet.COMMAND`; its help ends with examples, each what follows the command."""
+    return argparse.ArgumentParser(
+        prog=f"python -m hvnet.{command}",
+        description=textwrap.fill(description, 98),
+        epilog="\n".join(["examples:", *(f"  python -m hvnet.{command} {example}".rstrip() for example in examples)]),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def add_device(parser: argparse.ArgumentParser) -> None:
+    """The option --device."""
+    parser.add_argument("--device", default="auto", metavar="NAME", help="auto, cpu, cuda or cuda:1 (default: auto)")
 
 
 def run_command(main: Callable[[Sequence[str] | None], None]) -> None:

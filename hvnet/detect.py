@@ -4,7 +4,6 @@
 test set in its root (the readme of KITTI's object devkit), checked line by line before it is written.
 """
 
-import argparse
 import csv
 import math
 import zipfile
@@ -18,7 +17,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from hvnet.cli import InputError, run_command
+from hvnet.cli import InputError, add_device, make_parser, run_command
 from hvnet.data.clouds import SUFFIXES, read_cloud
 from hvnet.data.kitti import (
     IMAGE_SIZE,
@@ -240,17 +239,18 @@ def detect(detector: Detector, sources: Sequence[Source], out: Path, pictures: i
 
 def main(arguments: Sequence[str] | None) -> None:
     """The command."""
-    parser = argparse.ArgumentParser(
-        prog="python -m hvnet.detect",
-        description="Detects objects in point clouds; writes KITTI result files (results/), all boxes in LiDAR axes\n"
-        "(boxes.csv) and bird's eye views (pictures/). Where every cloud is a KITTI frame with labels, the\n"
-        "results are scored, too. --split test writes submission.zip for the KITTI server.",
-        epilog="examples:\n  python -m hvnet.detect cloud.bin\n"
-        "  python -m hvnet.detect cloud.pcd --checkpoint runs/demo/checkpoint.pt\n"
-        "  python -m hvnet.detect clouds/ --checkpoint runs/demo/checkpoint.pt --pictures 0\n"
-        "  python -m hvnet.detect /data/kitti --split val --checkpoint runs/compact/checkpoint.pt --out val\n"
-        "  python -m hvnet.detect /data/kitti --split test --checkpoint runs/hvnet/checkpoint.pt --out test",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = make_parser(
+        "detect",
+        "Detects objects in point clouds; writes KITTI result files (results/), all boxes in LiDAR axes (boxes.csv) "
+        "and bird's eye views (pictures/). Where every cloud is a KITTI frame with labels, the results are scored. "
+        "--split test writes submission.zip for the KITTI server.",
+        [
+            "cloud.bin",
+            "cloud.pcd --checkpoint runs/demo/checkpoint.pt",
+            "clouds/ --pictures 0",
+            "/data/kitti --split val --out val",
+            "/data/kitti --split test --checkpoint runs/hvnet/checkpoint.pt --out test",
+        ],
     )
     parser.add_argument(
         "inputs", nargs="+", type=Path, metavar="INPUT", help=f"files ({', '.join(SUFFIXES)}), folders, KITTI roots"
@@ -258,7 +258,9 @@ def main(arguments: Sequence[str] | None) -> None:
     parser.add_argument(
         "--checkpoint", type=Path, metavar="FILE", help="of python -m hvnet.train (default: the weights of the package)"
     )
-    parser.add_argument("--split", help="frames of ImageSets/SPLIT.txt of a KITTI root (default: all frames)")
+    parser.add_argument(
+        "--split", metavar="NAME", help="frames of ImageSets/NAME.txt of a KITTI root (default: all frames)"
+    )
     parser.add_argument(
         "--partial", action="store_true", help="with --split test: take the frames there are; no submission is written"
     )
@@ -270,7 +272,7 @@ def main(arguments: Sequence[str] | None) -> None:
         metavar="N",
         help="draw the first N clouds, with boxes of score 0.5 or more (default: 20)",
     )
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
+    add_device(parser)
     options = parser.parse_args(arguments)
 
     if options.out.exists() and (not options.out.is_dir() or any(options.out.iterdir())):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from hvnet.boxes import points_in_boxes
-from hvnet.cli import InputError, run_command
+from hvnet.cli import InputError, make_parser, run_command
 from hvnet.data.kitti import (
     Calibration,
     Labels,
@@ -475,17 +475,16 @@ def _band(text: str) -> tuple[float, float]:
 
 def main(argv: Sequence[str] | None) -> None:
     """The command `python -m hvnet.evaluate`."""
-    parser = argparse.ArgumentParser(
-        prog="python -m hvnet.evaluate",
-        description="Scores KITTI result files of any detector as KITTI's devkit does, and reports what is missed.",
-        epilog="examples:\n"
-        "  python -m hvnet.evaluate --labels KITTI/training/label_2 --predictions val/results \\\n"
-        "    --frames KITTI/ImageSets/val.txt --json val.json --plot val.png\n"
-        "  python -m hvnet.evaluate --labels labels --predictions results --no-2d-filter     # data without images\n"
-        "  python -m hvnet.evaluate --labels labels --predictions results --distance-bands 0-20 20-40 40-60\n"
-        "  python -m hvnet.evaluate --labels KITTI/training/label_2 --predictions results --missing-as-empty \\\n"
-        "    --clouds KITTI/training --score 0.5 --classes Car                 # where are cars missed at score 0.5?",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = make_parser(
+        "evaluate",
+        "Scores KITTI result files of any detector as KITTI's devkit does, and reports what is missed.",
+        [
+            "--labels KITTI/training/label_2 --predictions results --frames val.txt",
+            "--labels labels --predictions results --json val.json --plot val.png",
+            "--labels labels --predictions results --no-2d-filter",
+            "--labels labels --predictions results --distance-bands 0-20 20-40",
+            "--labels labels --predictions results --score 0.5 --classes Car",
+        ],
     )
     parser.add_argument("--labels", type=Path, required=True, metavar="DIR", help="label files (KITTI's label_2)")
     parser.add_argument("--predictions", type=Path, required=True, metavar="DIR", help="result files with scores")
@@ -493,7 +492,9 @@ def main(argv: Sequence[str] | None) -> None:
     parser.add_argument(
         "--missing-as-empty", action="store_true", help="a frame without result file has no detections (else an error)"
     )
-    parser.add_argument("--classes", nargs="+", choices=CLASSES, default=CLASSES, help="what to score (default: all)")
+    parser.add_argument(
+        "--classes", nargs="+", choices=CLASSES, default=CLASSES, metavar="CLASS", help="(default: all)"
+    )
     parser.add_argument(
         "--no-2d-filter",
         action="store_true",

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
-from hvnet.cli import InputError, run_command
+from hvnet.cli import InputError, add_device, make_parser, run_command
 from hvnet.config import Config, SyntheticConfig, config_to_dict, load_config
 from hvnet.data.kitti import detections_to_labels, read_frame, read_split
 from hvnet.detector import Detector, load
@@ -363,7 +363,7 @@ def draw_trained(path: Path, name: str, outcomes: Sequence[Outcome], times: dict
         axes.grid(axis="x", alpha=0.3)
         axes.set_xlabel("BEV mAP, moderate (%)")
         axes.legend(handles=handles, fontsize=8)
-    axes.set_title(f"{name}: {study.shows}", fontsize=10)
+    figure.suptitle(f"{name}: {study.shows}", fontsize=10)
     figure.savefig(path, dpi=110)
 
 
@@ -519,17 +519,18 @@ def scenes_of(config: Config) -> Config:
 
 def main(arguments: Sequence[str] | None) -> None:
     """The command."""
-    parser = argparse.ArgumentParser(
-        prog="python -m hvnet.study",
-        description="Runs a study of the paper: trains its rows and writes a table beside the paper's figures (.md),\n"
-        "all rows (.csv) and a picture (.png). What is done already is kept, so that a study can be stopped\n"
-        "and begun again with the same command.",
-        epilog="examples:\n  python -m hvnet.study --list\n"
-        "  python -m hvnet.study speed\n"
-        "  python -m hvnet.study components --budget steps=600\n"
-        "  python -m hvnet.study density --rows lossless limit-8 --validate /data/kitti\n"
-        "  python -m hvnet.study components --data /data/kitti --base configs/hvnet.yaml --device cuda",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = make_parser(
+        "study",
+        "Runs a study of the paper: trains its rows and writes a table beside the paper's figures (.md), all rows "
+        "(.csv) and a picture (.png). What is done already is kept, so that a study can be stopped and begun again "
+        "with the same command.",
+        [
+            "--list",
+            "speed",
+            "components --budget steps=600",
+            "density --rows lossless limit-8 --validate /data/kitti",
+            "components --data /data/kitti --base configs/hvnet.yaml --device cuda",
+        ],
     )
     parser.add_argument("name", nargs="?", choices=[*STUDIES], metavar="NAME", help=", ".join(STUDIES))
     parser.add_argument("--list", action="store_true", help="say what each study shows and what it costs")
@@ -538,7 +539,7 @@ def main(arguments: Sequence[str] | None) -> None:
         "--validate", type=Path, metavar="DIR", help="a KITTI root whose validation frames score every row, too"
     )
     parser.add_argument("--out", type=Path, default=Path("runs/studies"), metavar="DIR", help="(default: runs/studies)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
+    add_device(parser)
     parser.add_argument("--budget", metavar="epochs=N|steps=N", help="length of every training (default: the config's)")
     parser.add_argument("--seeds", type=int, default=2, metavar="N", help="trainings of every row (default: 2)")
     parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")

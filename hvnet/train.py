@@ -4,7 +4,6 @@ On a GPU the frames, the database and the augmentation live on the device. Sever
 one model together: each takes its share of every batch, and rank 0 prints and writes.
 """
 
-import argparse
 import contextlib
 import hashlib
 import json
@@ -27,7 +26,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from hvnet import ranks
-from hvnet.cli import InputError, run_command
+from hvnet.cli import InputError, add_device, make_parser, run_command
 from hvnet.config import Config, TrainConfig, config_to_dict, load_config
 from hvnet.data.augment import Objects, augment, mix_sectors, objects_of
 from hvnet.data.database import FILE_NAME, Database, build_database, read_database, write_database
@@ -609,21 +608,21 @@ def choose_out(given: str | None, config: Path, resume: bool) -> Path:
 
 def main(arguments: Sequence[str] | None) -> None:
     """The command."""
-    parser = argparse.ArgumentParser(
-        prog="python -m hvnet.train",
-        description="Trains HVNet, validates it as KITTI does, and writes checkpoint.pt, metrics.jsonl, tensorboard/"
-        " and pictures/ to the run's folder.",
-        epilog="examples:\n  python -m hvnet.train\n"
-        "  python -m hvnet.train --config configs/compact.yaml --data /data/kitti --set train.batch_size=2\n"
-        "  python -m hvnet.train --out runs/demo --resume\n"
-        "  torchrun --nproc-per-node 8 -m hvnet.train --config configs/hvnet.yaml --data /data/kitti",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = make_parser(
+        "train",
+        "Trains HVNet, validates it as KITTI does, and writes checkpoint.pt, metrics.jsonl, tensorboard/ and pictures/ "
+        "to the run's folder. To train on 8 GPUs, put torchrun --nproc-per-node 8 in the place of python.",
+        [
+            "",
+            "--config configs/compact.yaml --data /data/kitti --set train.batch_size=2",
+            "--out runs/demo --resume",
+        ],
     )
     parser.add_argument("--config", type=Path, default=DEMO, metavar="FILE", help="YAML (default: configs/demo.yaml)")
     parser.add_argument("--data", type=Path, metavar="DIR", help="a KITTI root (default: scenes are generated)")
     parser.add_argument("--out", metavar="DIR", help="folder of the run (default: runs/NAME of the config)")
     parser.add_argument("--resume", action="store_true", help="go on with the run in --out (default: the latest)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
+    add_device(parser)
     parser.add_argument(
         "--set",
         action="append",

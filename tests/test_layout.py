@@ -24,6 +24,7 @@ NETWORK = {"config", "boxes", "anchors", "encoder", "pillars", "backbone", "head
 DATA = {"data.kitti", "data.clouds", "data.database", "data.augment", "data.synthetic", "data.shapes"}
 ALLOWED = {f"kernels.{name}": allowed for name, allowed in KERNELS.items()} | {
     "__init__": {"detector"},
+    "__main__": set(),
     "cli": set(),
     "boxes": set(),
     "config": set(),

@@ -6,7 +6,6 @@ One compressed .npz file holds the objects of a split, in the order of its frame
 kept in millimetres around the box's centre, the LiDAR's own resolution: seven bytes a point, and exact.
 """
 
-import argparse
 import os
 import zipfile
 import zlib
@@ -21,7 +20,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from hvnet.boxes import points_in_boxes
-from hvnet.cli import InputError, run_command
+from hvnet.cli import InputError, make_parser, run_command
 from hvnet.data.kitti import read_frame, read_split
 
 FILE_NAME = "gt_database.npz"
@@ -167,13 +166,15 @@ def read_database(path: Path) -> Database:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Builds the database of a split and writes it."""
-    parser = argparse.ArgumentParser(
-        prog="python -m hvnet.data.database",
-        description="Cuts every labelled object out of a KITTI split: the ground-truth database for augmentation.",
+    parser = make_parser(
+        "data.database",
+        "Cuts every labelled object out of a KITTI split: the ground-truth database for augmentation. Training builds "
+        "it by itself where the root holds none.",
+        ["--data /data/kitti", "--data /data/kitti --split trainval --out trainval.npz"],
     )
-    parser.add_argument("--data", type=Path, required=True, help="KITTI root: holds training/ and ImageSets/")
-    parser.add_argument("--split", default="train", help="name of the list in ImageSets (default: %(default)s)")
-    parser.add_argument("--out", type=Path, help=f"file to write (default: {FILE_NAME} in the KITTI root)")
+    parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="a KITTI root")
+    parser.add_argument("--split", default="train", metavar="NAME", help="of the list in ImageSets (default: train)")
+    parser.add_argument("--out", type=Path, metavar="FILE", help=f"(default: {FILE_NAME} in the KITTI root)")
     options = parser.parse_args(arguments)
     out: Path = options.out or options.data / FILE_NAME
     if out.exists():

@@ -4,7 +4,6 @@ Frame k depends on the seed and on k only. A scene is laid out in the road's axe
 sensor at 0) and turned to LiDAR axes: x forward, y left, z up, metres, the sensor 1.73 m above the ground.
 """
 
-import argparse
 import json
 import math
 import os
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from hvnet.boxes import bev_corners, boxes_collide, limit_angle
-from hvnet.cli import InputError, run_command
+from hvnet.cli import InputError, make_parser, run_command
 from hvnet.data import shapes
 from hvnet.data.kitti import (
     IMAGE_SIZE,
@@ -745,20 +744,31 @@ def _write_meta(root: Path, meta: dict[str, object]) -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Generates scenes from the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m hvnet.data.synthetic",
-        description="Generates street scenes, scanned by a simulated 64-beam LiDAR, in KITTI's layout.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
     default = Options()
-    parser.add_argument(
-        "--out", type=Path, required=True, default=argparse.SUPPRESS, help="folder to write; it must be new or empty"
+    parser = make_parser(
+        "data.synthetic",
+        "Generates street scenes, scanned by a simulated 64-beam LiDAR, in KITTI's layout. Frame k depends on the seed "
+        "and on k alone.",
+        ["--out scenes", "--out scenes --train 1000 --val 100 --distance 40 --seed 1"],
     )
-    parser.add_argument("--train", type=int, default=200, help="frames of the training split")
-    parser.add_argument("--val", type=int, default=40, help="frames of the validation split")
-    parser.add_argument("--seed", type=int, default=0, help="frame k depends on the seed and k alone")
-    parser.add_argument("--azimuth", type=float, default=default.azimuth, help="degrees scanned to either side of x")
-    parser.add_argument("--distance", type=float, default=default.distance[1], help="metres to the farthest object")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new or empty, or holds these scenes")
+    parser.add_argument("--train", type=int, default=200, metavar="N", help="frames to train on (default: 200)")
+    parser.add_argument("--val", type=int, default=40, metavar="N", help="frames to validate on (default: 40)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="(default: 0)")
+    parser.add_argument(
+        "--azimuth",
+        type=float,
+        default=default.azimuth,
+        metavar="DEGREES",
+        help=f"scanned to either side of x (default: {default.azimuth:g})",
+    )
+    parser.add_argument(
+        "--distance",
+        type=float,
+        default=default.distance[1],
+        metavar="METRES",
+        help=f"to the farthest object (default: {default.distance[1]:g})",
+    )
     args = parser.parse_args(argv)
     options = Options(azimuth=args.azimuth, distance=(default.distance[0], args.distance))
     generate(args.out, args.train, args.val, args.seed, options)

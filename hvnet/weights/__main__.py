@@ -4,14 +4,13 @@ It trains configs/compact.yaml by the recipe below and writes the result in half
 KITTI that docs/model_card.md names: 23 whole frames, and the objects of all 3712 training frames in gt_database.npz.
 """
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
 from hvnet import train
-from hvnet.cli import InputError, run_command
+from hvnet.cli import InputError, add_device, make_parser, run_command
 from hvnet.data.database import FILE_NAME
 from hvnet.model import load_checkpoint, save_checkpoint
 
@@ -46,12 +45,18 @@ def halve(checkpoint: Path, out: Path) -> None:
 
 def main(arguments: Sequence[str] | None) -> None:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python -m hvnet.weights", description=__doc__)
+    parser = make_parser(
+        "weights",
+        "Makes the weights of the package anew: trains configs/compact.yaml by a recipe and writes the result in half "
+        "precision. The root is the piece of KITTI that docs/model_card.md names: 23 whole frames, and the objects of "
+        "all 3712 training frames in gt_database.npz.",
+        ["--data /data/kitti", "--data /data/kitti --resume"],
+    )
     parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="a KITTI root with gt_database.npz")
     parser.add_argument("--run", type=Path, default=Path("runs/weights"), metavar="DIR", help="(default: runs/weights)")
     parser.add_argument("--out", type=Path, default=Path("compact.pt"), metavar="FILE", help="(default: compact.pt)")
     parser.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
+    add_device(parser)
     options = parser.parse_args(arguments)
     if not (options.data / FILE_NAME).is_file():
         raise InputError(f"{options.data / FILE_NAME}: no such file; other objects would make other weights")

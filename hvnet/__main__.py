@@ -1,0 +1,16 @@
+"""`python -m hvnet` lists the commands."""
+
+COMMANDS = {
+    "detect": "boxes for clouds",
+    "train": "train and validate; without arguments the demo, on generated scenes",
+    "evaluate": "score KITTI result files of any detector",
+    "study": "rerun the paper's tables and figures",
+    "data.synthetic": "generate street scenes in KITTI's layout",
+    "data.database": "cut the labelled objects out of a KITTI split",
+    "weights": "make the weights of the package anew",
+}
+
+if __name__ == "__main__":
+    print("HVNet detects cars, pedestrians and cyclists in LiDAR clouds. Commands, each with --help:\n")
+    for command, does in COMMANDS.items():
+        print(f"  python -m hvnet.{command:<15} {does}")
