@@ -55,10 +55,10 @@ def make_anchors(config: Config, entry: ClassConfig) -> Tensor:
 def encode(boxes: Tensor, anchors: Tensor, regression: str = "corners") -> tuple[Tensor, Tensor, Tensor]:
     """Boxes (P, 7) against anchors (P, 7): location (P, 8) or (P, 5), vertical (P, 2), direction (P,) int64.
 
-    Both are those of the half-turn of the box that is nearer to the anchor; direction is 1 where that is not the box's
-    own heading. The location of "corners" is their offsets in metres, that of "pose" (dx / diagonal, dy / diagonal,
-    log(l / anchor length), log(w / anchor width), dtheta); vertical is (dz / anchor height, log(h / anchor height)),
-    these as in VoxelNet.
+    The location is that of the half-turn of the box that is nearer to the anchor; direction is 1 where that is not the
+    box's own heading. The location of "corners" is their offsets in metres, that of "pose" (dx / diagonal, dy /
+    diagonal, log(l / anchor length), log(w / anchor width), dtheta); vertical is (dz / anchor height, log(h / anchor
+    height)). Pose and vertical are VoxelNet's.
     """
     turned = limit_angle(boxes[:, 6] - anchors[:, 6]).abs() > math.pi / 2
     nearer = boxes.clone()

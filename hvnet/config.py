@@ -35,8 +35,8 @@ class EncoderConfig:
     # AVFE and AVFEO; VoxelNet's VFE layers in their place; or one layer of PointPillars' features
     vfe: Literal["attentive", "plain", "pillar"] = "attentive"
     attention_relu: bool = False  # a ReLU before the product of the AVFE layers
-    point_limit: int = 0  # most points of a voxel of voxel_size, and most such voxels of a sample, as networks of hard
-    voxel_limit: int = 0  # voxels have them: the points beyond are dropped; 0 is no limit
+    point_limit: int = 0  # hard voxels: most points of a voxel of voxel_size, the others are dropped; 0 is no limit
+    voxel_limit: int = 0  # most such voxels of a sample
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ def _override(tree: dict[str, Any], override: str) -> None:
     node: Any = tree
     for parent in parents:
         if isinstance(node, list):
-            node = next((entry for entry in node if entry.get("name") == parent), None)
+            node = next((entry for entry in node if isinstance(entry, dict) and entry.get("name") == parent), None)
         else:
             node = node.setdefault(parent, {})
         if not isinstance(node, dict) and not (isinstance(node, list) and parent == "classes"):
@@ -349,10 +349,12 @@ def _check(config: Config, source: str) -> None:
         want(getattr(encoder, key) >= 0, f"encoder.{key}", "0 (none) or more", getattr(encoder, key))
     want(encoder.voxel_limit == 0 or encoder.point_limit > 0, "encoder.voxel_limit", "a point_limit beside it", "none")
     if encoder.vfe == "pillar":
-        want(encoder.projection_scales == (1.0,), "encoder.projection_scales", "[1.0] for pillars",
-             list(encoder.projection_scales))  # fmt: skip
-        want(encoder.point_limit > 0, "encoder.point_limit", "1 or more for pillars", encoder.point_limit)
-        padded = encoder.point_limit * (encoder.voxel_limit or MOST_CELLS)
+        for key in ("feature_scales", "projection_scales"):
+            scales = getattr(encoder, key)
+            want(scales == (1.0,), f"encoder.{key}", "[1.0] for pillars", list(scales))
+        for key in ("point_limit", "voxel_limit"):
+            want(getattr(encoder, key) > 0, f"encoder.{key}", "1 or more for pillars", getattr(encoder, key))
+        padded = encoder.point_limit * encoder.voxel_limit
         want(padded <= MOST_CELLS, "encoder.voxel_limit", f"at most {MOST_CELLS} places of points in pillars", padded)
     blocks = max(3, len(encoder.projection_scales))
     want(backbone.stride in (1, 2), "backbone.stride", "1 or 2", backbone.stride)

@@ -29,9 +29,16 @@ def hard_voxels(
     points: Tensor, sample: Tensor, batch_size: int, grid: Grid, point_limit: int, voxel_limit: int
 ) -> HardVoxels:
     """The first `point_limit` points of a voxel, in the order of the cloud, and of each sample the first `voxel_limit`
-    voxels, in the order of their first points; a limit of 0 is none. Points (N, 4) of samples (N,)."""
+    voxels, in the order of their first points; a limit of 0 is none. Points (N, 4) of samples (N,).
+
+    VoxelNet and PointPillars choose at random which points stay. The first ones are the same in every run, but they are
+    no fair sample where a scanner gives its rings one after the other: KITTI's begin at the top.
+    """
     index = voxel_index(points, sample, batch_size, [grid])
-    cursor, (voxel, starts, _) = index.scales[0]
+    cursor, (voxel, starts, by_voxel) = index.scales[0]
+    order = index.order
+    if by_voxel is not None:  # the index is hashed
+        order, voxel = order[by_voxel], voxel[by_voxel]
     kept = torch.ones_like(voxel, dtype=torch.bool)
     # within one grid the order of the points of a voxel is that of the cloud
     place = torch.arange(len(voxel), device=voxel.device) - starts[voxel]
@@ -39,7 +46,7 @@ def hard_voxels(
         kept &= place < point_limit
     if voxel_limit:
         of_sample = cursor // (grid.shape[0] * grid.shape[1])
-        first = index.order[starts[:-1]] + of_sample * len(points)
+        first = order[starts[:-1]] + of_sample * len(points)
         rank = torch.empty_like(first)
         rank[first.argsort()] = torch.arange(len(first), device=first.device)
         before = torch.bincount(of_sample, minlength=batch_size).cumsum(0)
@@ -47,7 +54,7 @@ def hard_voxels(
         taken = rank < voxel_limit
         kept &= taken[voxel]
         voxel, cursor = (taken.cumsum(0) - 1)[voxel], cursor[taken]
-    return HardVoxels(index.order[kept], voxel[kept], place[kept], cursor)
+    return HardVoxels(order[kept], voxel[kept], place[kept], cursor)
 
 
 class PillarEncoder(nn.Module):

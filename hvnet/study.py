@@ -8,12 +8,13 @@ trained once.
 import argparse
 import contextlib
 import csv
+import fcntl
 import hashlib
 import itertools
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,13 +27,14 @@ from tqdm import tqdm
 
 from hvnet.cli import InputError, add_device, make_parser, run_command
 from hvnet.config import Config, SyntheticConfig, config_to_dict, load_config
-from hvnet.data.kitti import detections_to_labels, read_frame, read_split
+from hvnet.data.kitti import Frame, Labels, detections_to_labels, read_frame, read_split
 from hvnet.detector import Detector, load
 from hvnet.evaluate import CLASSES, evaluate
 from hvnet.kernels.voxel import make_grid
+from hvnet.matching import LEVELS, select_truths
 from hvnet.model import HVNet, device_name, select_device
 from hvnet.pillars import hard_voxels
-from hvnet.train import caught_signals, generated_scenes, train
+from hvnet.train import caught_signals, check_classes, generated_scenes, train
 
 CONFIGS = Path(__file__).resolve().parent / "configs" / "studies"
 TIMED_CLOUDS = 10
@@ -127,6 +129,10 @@ STUDIES = {
         ),
     ),
 }
+UNFUSED = (
+    " Rows with * have an encoder without fused kernels (these are for attention, voxels that nest, and all points): "
+    "their times say nothing about the row's idea."
+)
 PAPER_STAGES = (12.0, 11.0, 9.0)
 """Encoder, backbone, head with NMS of the paper's 32 ms for one class on an RTX 2080 Ti (Sec. 4.3)."""
 
@@ -141,20 +147,21 @@ class Outcome(NamedTuple):
     seed: int
     checkpoint: Path
     steps: int
-    seconds: float
+    seconds: float | None  # None if the training was stopped in between
     parameters: int
+    device: str
     dropped: float  # share of the points in range that no voxel has a place for, in the validation frames
     scores: Scores
-    real: Scores | None  # on the frames of --validate
+    real_dropped: float | None = None  # both on the frames of --validate
+    real: Scores | None = None
 
     def mean_ap(self, level: int = 1) -> float:
-        """BEV mAP in % of easy, moderate or hard objects."""
-        return mean_ap(self.scores, level)
+        """BEV mAP in % of easy, moderate or hard objects, over the classes that the frames hold."""
+        return mean_of([table["bev"][level] for table in self.scores.values()])
 
 
-def mean_ap(scores: Scores, level: int = 1) -> float:
-    """The mean of the BEV AP of the classes that the frames hold."""
-    values = [table["bev"][level] for table in scores.values()]
+def mean_of(values: Sequence[float | None]) -> float:
+    """The mean of the values that there are; NaN of none."""
     known = [value for value in values if value is not None]
     return sum(known) / len(known) if known else math.nan
 
@@ -171,19 +178,31 @@ def with_budget(config: Config, budget: str, frames: int) -> Config:
 
 
 def score(detector: Detector, root: Path, ids: Sequence[str]) -> Scores:
-    """BEV and 3D AP and AOS on frames of a KITTI root; objects outside of the detector's range do not count."""
-    low, high = np.reshape(detector.config.encoder.point_range, (2, 3))[:, :2]
+    """Exact BEV and 3D AP and AOS on frames of a KITTI root; objects outside of the detector's range do not count."""
     truths, found = [], []
     for name in tqdm(ids, desc="scoring", unit="frame", leave=False, dynamic_ncols=True):
         frame = read_frame(root, name)
         boxes = detector(frame.points)
         names = [detector.classes[label] for label in boxes.labels.tolist()]
         found.append(detections_to_labels(boxes.boxes, boxes.scores, names, frame.calib, frame.image_size))
-        centres = frame.calib.to_lidar(frame.labels.location)[:, :2]
-        near = ((centres >= low) & (centres < high)).all(axis=1)
-        truths.append(frame.labels.select(near | (frame.labels.name == "DontCare")))
+        truths.append(labels_in_range(frame, detector.config))
     result = evaluate(truths, found, classes=detector.classes)
-    return {name: {measure: table["exact"][measure] for measure in MEASURES} for name, table in result.items()}
+    none: list[float | None] = [None] * 3  # of a measure that the labels do not allow
+    return {name: {m: table["exact"].get(m, none) for m in MEASURES} for name, table in result.items()}
+
+
+def labels_in_range(frame: Frame, config: Config) -> Labels:
+    """The labels whose centre is in the config's range, and DontCare."""
+    low, high = np.reshape(config.encoder.point_range, (2, 3))[:, :2]
+    centres = frame.calib.to_lidar(frame.labels.location)[:, :2]
+    near = ((centres >= low) & (centres < high)).all(axis=1)
+    return frame.labels.select(near | (frame.labels.name == "DontCare"))
+
+
+def count_cars(config: Config, root: Path, ids: Sequence[str]) -> int:
+    """The moderate cars in range: one of them is so many times less than 100 points of recall."""
+    labels = [labels_in_range(read_frame(root, name), config) for name in ids]
+    return sum(int(select_truths(each, "Car", LEVELS[1]).sum()) for each in labels)
 
 
 def dropped_share(config: Config, root: Path, ids: Sequence[str]) -> float:
@@ -201,38 +220,70 @@ def dropped_share(config: Config, root: Path, ids: Sequence[str]) -> float:
     return 1 - kept / max(1, whole)
 
 
-def run_row(
-    row: Row, config: Config, root: Path, real: Path | None, rows: Path, device: torch.device, signals: list[int]
-) -> Outcome:
-    """Trains and scores a row, or takes up what of it there is in the folder `rows`."""
-    frames = [read_split(root, split) for split in (config.train.train_split, config.train.val_split)]
-    identity = json.dumps([config_to_dict(config), root.name, frames])
-    folder = rows / hashlib.sha256(identity.encode()).hexdigest()[:16]
+def run_row(row: Row, config: Config, root: Path, real: Path | None, folder: Path, device: torch.device) -> Outcome:
+    """Trains and scores a row in a folder, or takes up what of it there is."""
     checkpoint, file = folder / "checkpoint.pt", folder / "result.json"
-    known: dict[str, Any] = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    known = read_result(file)
     if "scores" not in known:
-        begin = time.monotonic()
+        begin, resumed = time.monotonic(), checkpoint.is_file()
         folder.mkdir(parents=True, exist_ok=True)
-        with (folder / "log.txt").open("a", encoding="utf-8") as log, contextlib.redirect_stdout(log):
-            train(config, root, folder, device, checkpoint.is_file(), signals)
-        seconds = time.monotonic() - begin
-        detector = load(checkpoint, str(device))
-        steps = config.train.epochs * max(1, config.train.repeat * len(frames[0]) // config.train.batch_size)
+        try:
+            with (
+                (folder / "log.txt").open("a", encoding="utf-8") as log,
+                contextlib.redirect_stdout(log),
+                caught_signals() as signals,
+            ):
+                train(config, root, folder, device, resumed, signals)
+        except SystemExit:
+            print("stopped; the same command goes on from here", flush=True)
+            raise
+        seconds = None if resumed else time.monotonic() - begin
+        train_ids, val_ids = (read_split(root, at) for at in (config.train.train_split, config.train.val_split))
         known = {
-            "steps": steps,
+            "steps": config.train.epochs * max(1, config.train.repeat * len(train_ids) // config.train.batch_size),
             "seconds": seconds,
             "parameters": sum(weight.numel() for weight in HVNet(config).parameters()),
-            "dropped": dropped_share(config, root, frames[1]),
-            "scores": score(detector, root, frames[1]),
+            "device": describe(device),
+            "dropped": dropped_share(config, root, val_ids),
+            "scores": score(load(checkpoint, str(device)), root, val_ids),
         }
-    if real is not None and known.get("real_root") != str(real):
+        write_result(file, known)
+    if real is not None and (known.get("real_root") != str(real) or "real_dropped" not in known):
         ids = read_split(real, config.train.val_split)
-        known |= {"real_root": str(real), "real": score(load(checkpoint, str(device)), real, ids)}
+        known |= {"real_root": str(real), "real_dropped": dropped_share(config, real, ids)}
+        known |= {"real": score(load(checkpoint, str(device)), real, ids)}
+        write_result(file, known)
+    found = {key: known[key] for key in ("steps", "seconds", "parameters", "dropped", "scores")}
+    of_real = {key: known[key] for key in ("real_dropped", "real")} if real is not None else {}
+    where = known.get("device", describe(device))
+    return Outcome(row, config.train.seed, checkpoint, device=where, **found, **of_real)
+
+
+def row_folder(rows: Path, config: Config, data: str, frames: Sequence[Sequence[str]]) -> Path:
+    """The folder of a row: config, data and frames are in its name."""
+    identity = json.dumps([config_to_dict(config), data, frames])
+    return rows / hashlib.sha256(identity.encode()).hexdigest()[:16]
+
+
+def read_result(file: Path) -> dict[str, Any]:
+    """What is known of a row; nothing if the file is not there or damaged."""
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+
+
+def write_result(file: Path, known: dict[str, Any]) -> None:
+    """Writes what is known of a row, whole or not at all."""
     partial = file.with_suffix(".partial")
     partial.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
     partial.replace(file)
-    found = {key: known[key] for key in ("steps", "seconds", "parameters", "dropped", "scores")}
-    return Outcome(row, config.train.seed, checkpoint, **found, real=known["real"] if real is not None else None)
+
+
+def describe(device: torch.device) -> str:
+    """The device, its threads, and the version of torch."""
+    threads = f", {torch.get_num_threads()} thread(s)" if device.type == "cpu" else ""
+    return f"{device_name(device)}{threads}, torch {torch.__version__}"
 
 
 def time_stages(detectors: dict[str, Detector], clouds: Sequence[Tensor]) -> dict[str, Times]:
@@ -264,34 +315,37 @@ def mark(device: torch.device) -> float:
 
 
 def agreement(outcomes: Sequence[Outcome]) -> tuple[int, int, float]:
-    """Of how many pairs of rows the seeds agree which is better, of how many pairs, and how far two seeds of a row are
+    """Of how many pairs of rows all seeds agree which is better, of how many pairs, and how far the seeds of a row are
     apart in the median, in points of mAP."""
     of_row: dict[str, list[float]] = {}
     for outcome in outcomes:
-        of_row.setdefault(outcome.row.name, []).append(outcome.mean_ap())
+        if not math.isnan(outcome.mean_ap()):
+            of_row.setdefault(outcome.row.name, []).append(outcome.mean_ap())
     alike = pairs = 0
     for a, b in itertools.combinations(of_row.values(), 2):
-        signs = {x > y for x, y in zip(a, b, strict=False)}
-        alike, pairs = alike + (len(signs) == 1), pairs + 1
+        differences = [x - y for x, y in zip(a, b, strict=False)]
+        alike += min(differences) > 0 or max(differences) < 0
+        pairs += 1
     spread = [max(values) - min(values) for values in of_row.values()]
-    return alike, pairs, float(np.median(spread))
+    return alike, pairs, float(np.median(spread)) if spread else math.nan
 
 
-def figure(value: float | None, digits: int = 1) -> str:
+def shown(value: float | None, digits: int = 1) -> str:
     """A figure of a table; a dash where there is none."""
     return "-" if value is None or math.isnan(value) else f"{value:.{digits}f}"
 
 
-def trained_table(study: Study, outcomes: Sequence[Outcome], times: dict[str, Times]) -> list[str]:
+def trained_table(study: Study, outcomes: Sequence[Outcome], times: dict[str, Times], fused: set[str]) -> list[str]:
     """The Markdown table of a study whose rows were trained."""
     seeds = sorted({outcome.seed for outcome in outcomes})
-    real = outcomes[0].real is not None
+    real = all(outcome.real is not None for outcome in outcomes)
     limited = any(outcome.dropped > 0 for outcome in outcomes)
-    measures = [("Car", "bev"), ("Pedestrian", "bev"), ("Cyclist", "bev"), ("Car", "3d")]
+    measures = [(name, "bev") for name in outcomes[0].scores] + [("Car", "3d")]
     measures += [("Car", "aos")] if any(row.name == "direction" for row in study.rows) else []
-    head = ["row", "paper mAP", "mAP", *(f"seed {seed}" for seed in seeds)]
+    measures = [(name, measure) for name, measure in measures if name in outcomes[0].scores]
+    head = ["row", *["paper mAP"] * any(row.paper for row in study.rows), "mAP", *(f"seed {seed}" for seed in seeds)]
     head += [name if measure == "bev" else f"{name} {measure.upper()}" for name, measure in measures]
-    head += ["dropped %"] * limited + ["real Car"] * real + ["time"]
+    head += ["dropped %"] * limited + ["real: dropped %"] * (limited and real) + ["real: Car"] * real + ["time"]
     lines = ["| " + " | ".join(head) + " |", "| --- |" + " ---: |" * (len(head) - 1)]
     first = None
     for row in study.rows:
@@ -300,19 +354,16 @@ def trained_table(study: Study, outcomes: Sequence[Outcome], times: dict[str, Ti
             continue
         whole = sum(times[row.name])
         first = first or whole
-        cells = [row.label, figure(row.paper), figure(float(np.mean([each.mean_ap() for each in own])))]
-        cells += [figure(each.mean_ap()) for each in own] + ["-"] * (len(seeds) - len(own))
-        cells += [figure(mean_of([each.scores[name][measure][1] for each in own])) for name, measure in measures]
-        cells += [figure(100 * own[0].dropped)] * limited
-        cells += [figure(mean_of([(each.real or {})["Car"]["bev"][1] for each in own]))] if real else []
-        lines.append("| " + " | ".join([*cells, f"{whole / first:.2f}"]) + " |")
+        cells = [row.label, *[shown(row.paper)] * any(row.paper for row in study.rows)]
+        cells += [shown(mean_of([each.mean_ap() for each in own]))]
+        cells += [shown(each.mean_ap()) for each in own] + ["-"] * (len(seeds) - len(own))
+        cells += [shown(mean_of([each.scores[name][measure][1] for each in own])) for name, measure in measures]
+        cells += [shown(100 * own[0].dropped)] * limited
+        cells += [shown(100 * (own[0].real_dropped or 0.0))] * (limited and real)
+        cars = [each.real["Car"]["bev"][1] for each in own if each.real and "Car" in each.real]
+        cells += [shown(mean_of(cars))] * real
+        lines.append("| " + " | ".join([*cells, f"{whole / first:.2f}" + "*" * (row.name not in fused)]) + " |")
     return lines
-
-
-def mean_of(values: Sequence[float | None]) -> float | None:
-    """The mean of the values that there are."""
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if known else None
 
 
 def speed_table(study: Study, times: dict[str, Times], device: str) -> list[str]:
@@ -324,9 +375,14 @@ def speed_table(study: Study, times: dict[str, Times], device: str) -> list[str]
     for row in study.rows:
         if row.name in times:
             stages = times[row.name]
-            cells = [row.label, figure(row.paper), figure(sum(stages)), *map(figure, stages)]
+            cells = [row.label, shown(row.paper), shown(sum(stages)), *map(shown, stages)]
             lines.append("| " + " | ".join(cells) + " |")
-    cells = ["another device: RTX 2080 Ti (the paper's), one class", "32.0", "-", *map(figure, PAPER_STAGES)]
+    cells = [
+        "another device: RTX 2080 Ti (the paper's), one class",
+        shown(sum(PAPER_STAGES)),
+        "-",
+        *map(shown, PAPER_STAGES),
+    ]
     return [*lines, "| " + " | ".join(cells) + " |"]
 
 
@@ -334,7 +390,7 @@ def draw_trained(path: Path, name: str, outcomes: Sequence[Outcome], times: dict
     """Every seed of every row: mAP by rows, or against time with the study's curves."""
     study = STUDIES[name]
     rows = [row for row in study.rows if row.name in times]
-    means = {row.name: float(np.mean([o.mean_ap() for o in outcomes if o.row.name == row.name])) for row in rows}
+    means = {row.name: mean_of([o.mean_ap() for o in outcomes if o.row.name == row.name]) for row in rows}
     figure = Figure(figsize=(8, 5 if study.curves else 1.4 + 0.45 * len(rows)), layout="constrained")
     axes = figure.add_subplot()
     if study.curves:
@@ -346,7 +402,7 @@ def draw_trained(path: Path, name: str, outcomes: Sequence[Outcome], times: dict
                 seeds = [outcome.mean_ap() for outcome in outcomes if outcome.row.name == row.name]
                 axes.plot([at] * len(seeds), seeds, "_", color=colour, alpha=0.6)
                 axes.annotate(row.label, (at, means[row.name]), (5, 5), textcoords="offset points", fontsize=8)
-        axes.set_xlabel("ms a cloud (dots: means, dashes: seeds)")
+        axes.set_xlabel(f"ms a cloud on {outcomes[0].device} (dots: means, dashes: seeds)")
         axes.set_ylabel("BEV mAP, moderate (%)")
         axes.margins(x=0.15, y=0.1)
     else:
@@ -402,19 +458,19 @@ def write_csv(
         if row.name not in times:
             continue
         stages = dict(zip((f"{stage} ms" for stage in STAGES), (f"{t:.4g}" for t in times[row.name]), strict=True))
-        common = {"study": study, "row": row.name, "paper": figure(row.paper, 2)}
+        common = {"study": study, "row": row.name, "paper": shown(row.paper, 2)}
         own = [outcome for outcome in outcomes if outcome.row.name == row.name]
         for outcome in own:
             line: dict[str, object] = {"seed": outcome.seed, "steps": outcome.steps}
-            line |= {"train seconds": f"{outcome.seconds:.0f}", "parameters": outcome.parameters}
-            line |= {"dropped": f"{outcome.dropped:.5f}"}
+            line |= {"train seconds": shown(outcome.seconds, 0), "parameters": outcome.parameters}
+            line |= {"dropped": f"{outcome.dropped:.5f}", "real dropped": shown(outcome.real_dropped, 5)}
             for level, title in enumerate(("easy", "moderate", "hard")):
-                line[f"mAP {title}"] = figure(outcome.mean_ap(level), 3)
+                line[f"mAP {title}"] = shown(outcome.mean_ap(level), 3)
             for prefix, scores in (("", outcome.scores), ("real ", outcome.real or {})):
                 for name, measure in itertools.product(CLASSES, MEASURES):
                     value = scores[name][measure][1] if name in scores else None
-                    line[f"{prefix}{name} {measure}"] = figure(value, 3)
-            lines.append(common | line | stages | where)
+                    line[f"{prefix}{name} {measure}"] = shown(value, 3)
+            lines.append(common | line | stages | where | {"trained on": outcome.device})
         if not own:
             lines.append(common | stages | where)
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -427,94 +483,143 @@ def list_studies() -> str:
     """What each study shows and costs, for --list."""
     lines = []
     for name, study in STUDIES.items():
-        config = load_config(CONFIGS / name / f"{study.rows[-1].name}.yaml")
+        lines += [f"{name}", f"  shows  {study.shows}", f"  paper  {study.source}"]
         if name == "speed":
-            cost = f"{len(study.rows)} rows, timed; nothing is trained"
+            lines.append(f"  costs  {len(study.rows)} rows, timed; nothing is trained")
         else:
+            config = load_config(CONFIGS / "base.yaml")
             scenes = config.synthetic.train_frames if config.synthetic else 0
             steps = config.train.epochs * (scenes // config.train.batch_size)
-            cost = f"{len(study.rows)} rows a seed, each {steps} steps of {config.train.batch_size} generated scenes"
-        lines += [f"{name}", f"  shows  {study.shows}", f"  paper  {study.source}", f"  costs  {cost}"]
+            minutes = sum(5 if row.name.startswith("pillars") else 2 for row in study.rows)
+            cost = f"{len(study.rows)} rows of {steps} steps: about {minutes} minutes a seed on one core of an AMD EPYC"
+            lines.append(f"  costs  {cost}")
         lines += [f"    {row.name:<17}{row.label}" for row in study.rows]
-    lines.append("A step of 2 scenes takes about 0.2 s on one core of an AMD EPYC; rows that studies share train once.")
+    lines.append("Rows that studies share are trained once. By default every row is trained with two seeds.")
     return "\n".join(lines)
 
 
-def run_study(name: str, options: argparse.Namespace, signals: list[int]) -> None:
-    """Runs the rows that are wanted and writes the table, the CSV file and the picture."""
+@contextlib.contextmanager
+def locked(out: Path) -> Iterator[None]:
+    """One study at a time writes into a folder. Raises InputError if another is at it."""
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / "lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(f"{out}: another study is at work there; wait for it, or give another --out") from error
+        yield
+
+
+def run_rows(
+    name: str, configs: dict[str, Config], root: Path, frames: Sequence[Sequence[str]], options: argparse.Namespace
+) -> list[Outcome]:
+    """Trains the rows that are wanted, seed after seed; of the others it takes what there is already."""
+    device = select_device(options.device)
+    wanted = options.rows or list(configs)
+    outcomes: list[Outcome] = []
+    count = options.seeds * len(wanted)
+    done = 0
+    for seed, row in itertools.product(range(options.seeds), STUDIES[name].rows):
+        config = configs[row.name]
+        if options.budget:
+            config = with_budget(config, options.budget, len(frames[0]))
+        config = replace(config, train=replace(config.train, seed=config.train.seed + seed))
+        folder = row_folder(options.out / "rows", config, str(root) if options.data else root.name, frames)
+        if row.name not in wanted:
+            if "scores" in read_result(folder / "result.json"):
+                outcomes.append(run_row(row, config, root, options.validate, folder, device))
+            continue
+        done += 1
+        print(f"[{done}/{count}] {name}/{row.name}, seed {seed}: ", end="", flush=True)
+        outcomes.append(run_row(row, config, root, options.validate, folder, device))
+        print(f"mAP {outcomes[-1].mean_ap():.1f}, trained in {shown(outcomes[-1].seconds, 0)} s", flush=True)
+    return outcomes
+
+
+def speed_legend(clouds: Sequence[Tensor], data: str, config: Config) -> str:
+    """What was timed."""
+    points = int(np.median([len(each) for each in clouds]))
+    return (
+        f"Medians over {len(clouds)} clouds of {data} ({points:,} points in the median), {TIMED_ROUNDS} times each, "
+        "rows in turns. The networks are untrained and their threshold is 0, so that "
+        f"{config.head.candidates:,} candidates a class go through NMS, the most there can be."
+    )
+
+
+def agreement_legend(outcomes: Sequence[Outcome], seeds: int) -> str:
+    """What the seeds say of the order of the rows."""
+    alike, pairs, spread = agreement(outcomes)
+    return (
+        f"All {seeds} seeds agree on the order of {alike} of {pairs} pairs of rows (chance alone would make "
+        f"{pairs / 2 ** (seeds - 1):.0f}); the seeds of a row span {spread:.1f} points of mAP in the median. Smaller "
+        "differences mean nothing here."
+    )
+
+
+def run_study(name: str, options: argparse.Namespace) -> None:
+    """Runs a study and writes its table, its CSV file and its picture."""
     study = STUDIES[name]
     unknown = [row for row in options.rows or () if row not in [each.name for each in study.rows]]
     if unknown:
         known = ", ".join(row.name for row in study.rows)
         raise InputError(f"--rows {unknown[0]}: no row of {name}; there are {known}")
-    rows = [row for row in study.rows if not options.rows or row.name in options.rows]
+    for option in ("base", "budget", "validate"):
+        if name == "speed" and getattr(options, option) is not None:
+            raise InputError(f"--{option}: is not for speed, which trains nothing and rests on configs/hvnet.yaml")
     instead = (CONFIGS / "base.yaml", options.base) if options.base else None
-    configs = {row.name: load_config(CONFIGS / name / f"{row.name}.yaml", options.set, instead) for row in rows}
-    device = select_device(options.device)
-    options.out.mkdir(parents=True, exist_ok=True)
-    shown_device = f"{device_name(device)}" + (f", {torch.get_num_threads()} threads" if device.type == "cpu" else "")
+    configs = {row.name: load_config(CONFIGS / name / f"{row.name}.yaml", options.set, instead) for row in study.rows}
     first = next(iter(configs.values()))
-    root = options.data or generated_scenes(scenes_of(first), options.out)
-    frames = [read_split(root, split) for split in (first.train.train_split, first.train.val_split)]
+    check_classes(first, options.base or CONFIGS / "base.yaml")
+    if options.budget:
+        with_budget(first, options.budget, 1)
+    device = select_device(options.device)
+    if options.data is None and name == "speed" and first.synthetic is None:
+        first = replace(first, synthetic=SyntheticConfig(1, TIMED_CLOUDS))
+    if options.data is None and first.synthetic is None:
+        raise InputError(f"{options.base}: has no key synthetic, so the study needs --data with a KITTI root")
+    root = options.data or generated_scenes(first, options.out)
+    splits = (first.train.train_split, first.train.val_split)
+    frames = [read_split(root, split) for split in splits]
+    real = read_split(options.validate, splits[1]) if options.validate else []
+    clouds = [read_frame(root, at).points for at in frames[1][:TIMED_CLOUDS]]
+    data = root.name if options.data else f"generated scenes, seed {first.train.seed}"
+    lines = [f"# {name}: {study.shows}", "", f"In the paper: {study.source}.", ""]
     outcomes: list[Outcome] = []
     if name == "speed":
         torch.manual_seed(0)
-        detectors = {row.name: Detector(HVNet(configs[row.name]).eval(), device) for row in rows}
+        wanted = options.rows or list(configs)
+        times = time_stages({row: Detector(HVNet(configs[row]).eval(), device) for row in wanted}, clouds)
+        lines += [*speed_table(study, times, describe(device)), "", speed_legend(clouds, data, first)]
+        draw_speed(options.out / f"{name}.png", times, describe(device))
     else:
-        jobs = [(seed, row) for seed in range(options.seeds) for row in rows]
-        for k, (seed, row) in enumerate(jobs, start=1):
-            config = configs[row.name]
-            config = replace(config, train=replace(config.train, seed=seed))
-            if options.budget:
-                config = with_budget(config, options.budget, len(frames[0]))
-            print(f"[{k}/{len(jobs)}] {name}/{row.name}, seed {seed}: ", end="", flush=True)
-            outcomes.append(run_row(row, config, root, options.validate, options.out / "rows", device, signals))
-            print(f"mAP {outcomes[-1].mean_ap():.1f}, trained in {outcomes[-1].seconds:.0f} s", flush=True)
-        detectors = {o.row.name: load(o.checkpoint, str(device)) for o in outcomes if o.seed == 0}
-    times = time_stages(detectors, [read_frame(root, at).points for at in frames[1][:TIMED_CLOUDS]])
-    data = str(options.data) if options.data else f"generated scenes, seed {first.train.seed}"
-    where: dict[str, object] = {
-        "data": Path(data).name,
-        "train frames": len(frames[0]),
-        "val frames": len(frames[1]),
-        "real frames": len(read_split(options.validate, "val")) if options.validate else 0,
-        "device": shown_device,
-        "torch": torch.__version__,
-    }
-    lines = [f"# {name}: {study.shows}", "", f"The paper: {study.source}.", ""]
-    if name == "speed":
-        lines += speed_table(study, times, shown_device)
-        lines += ["", f"Medians of {len(frames[1][:TIMED_CLOUDS])} clouds, {TIMED_ROUNDS} times each, rows in turns."]
-        draw_speed(options.out / f"{name}.png", times, shown_device)
-    else:
-        lines += trained_table(study, outcomes, times)
-        steps = sorted({outcome.steps for outcome in outcomes})
+        outcomes = run_rows(name, configs, root, frames, options)
+        detectors = {o.row.name: load(o.checkpoint, str(device)) for o in outcomes if o.seed == first.train.seed}
+        times = time_stages(detectors, clouds)
+        fused = {row for row, detector in detectors.items() if detector.encoder.is_fused(1)}
+        lines += trained_table(study, outcomes, times, fused)
+        steps = " or ".join(map(str, sorted({outcome.steps for outcome in outcomes})))
+        trained_on = " and ".join(sorted({outcome.device for outcome in outcomes}))
         lines += [
             "",
-            f"AP: bird's eye view, exact, moderate, in %, at 0.7 (Car) and 0.5; time: of a cloud, the first row is 1. "
-            f"{where['data']}: {len(frames[0])} frames to train, {len(frames[1])} to validate"
-            + (f", {where['real frames']} real frames besides; " if options.validate else "; ")
-            + f"{' or '.join(map(str, steps))} steps of {first.train.batch_size} frames; {shown_device}; "
-            f"torch {torch.__version__}.",
+            "mAP and the classes: exact AP in bird's eye view, moderate, in %, at an overlap of 0.7 (Car) and 0.5, of "
+            f"the objects in range. {data}: {len(frames[0])} frames to train, {len(frames[1])} to validate; {steps} "
+            f"steps of {first.train.batch_size} frames; trained on {trained_on}.",
+            "",
+            f"Time: of a cloud on {describe(device)}; the first row is 1." + UNFUSED * (fused < set(detectors)),
         ]
-        if options.seeds > 1 and len(rows) > 1:
-            alike, pairs, spread = agreement(outcomes)
-            lines += [
-                "",
-                f"The {options.seeds} seeds agree on the order of {alike} of {pairs} pairs of rows; two seeds of a row "
-                f"are {spread:.1f} points of mAP apart in the median. Smaller differences mean nothing here.",
-            ]
+        if real:
+            cars = count_cars(first, options.validate, real)
+            lines += ["", f"Real: {len(real)} frames, which hold {cars} moderate cars in range."]
+        if options.seeds > 1 and len(times) > 1:
+            lines += ["", agreement_legend(outcomes, options.seeds)]
         draw_trained(options.out / f"{name}.png", name, outcomes, times)
+    where: dict[str, object] = {"data": data, "train frames": len(frames[0]), "val frames": len(frames[1])}
+    where |= {"real frames": len(real), "timed on": describe(device)}
     write_csv(options.out / f"{name}.csv", name, outcomes, times, where)
     (options.out / f"{name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     print("\n".join(lines) + "\n")
     for suffix, title in (("md", "table"), ("csv", "rows"), ("png", "picture")):
         print(f"{title + ':':<9}{options.out / f'{name}.{suffix}'}")
-
-
-def scenes_of(config: Config) -> Config:
-    """The config, with scenes to generate: the paper's setting, which names KITTI, is timed on two."""
-    return config if config.synthetic else replace(config, synthetic=SyntheticConfig(1, TIMED_CLOUDS))
 
 
 def main(arguments: Sequence[str] | None) -> None:
@@ -542,7 +647,9 @@ def main(arguments: Sequence[str] | None) -> None:
     add_device(parser)
     parser.add_argument("--budget", metavar="epochs=N|steps=N", help="length of every training (default: the config's)")
     parser.add_argument("--seeds", type=int, default=2, metavar="N", help="trainings of every row (default: 2)")
-    parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")
+    parser.add_argument(
+        "--rows", nargs="+", metavar="ROW", help="train only these rows; of the others show what is done already"
+    )
     parser.add_argument(
         "--base", type=Path, metavar="FILE", help="config under the rows (default: configs/studies/base.yaml)"
     )
@@ -558,8 +665,9 @@ def main(arguments: Sequence[str] | None) -> None:
         parser.error("want the NAME of a study, or --list")
     if options.seeds < 1:
         raise InputError(f"--seeds {options.seeds}: want 1 or more")
-    with caught_signals() as signals:
-        run_study(options.name, options, signals)
+    options.data, options.validate = (path.resolve() if path else None for path in (options.data, options.validate))
+    with locked(options.out):
+        run_study(options.name, options)
 
 
 if __name__ == "__main__":

@@ -338,8 +338,8 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
     batch_size = config.train.batch_size
     if batch_size % ranks.size():
         raise InputError(f"train.batch_size: want a multiple of the {ranks.size()} ranks, got {batch_size}")
-    if config.loss.uncertainty and ranks.size() > 1:
-        raise InputError("loss.uncertainty: is for one process; start without torchrun")
+    if ranks.size() > 1 and (config.loss.uncertainty or config.encoder.vfe == "pillar"):
+        raise InputError("loss.uncertainty and encoder.vfe=pillar: are for one process; start without torchrun")
     train_ids = read_split(root, config.train.train_split)
     val_ids = read_split(root, config.train.val_split)
     frames = hashlib.sha256(json.dumps([train_ids, val_ids]).encode()).hexdigest()
@@ -591,6 +591,14 @@ def generated_scenes(config: Config, folder: Path) -> Path:
     return root
 
 
+def check_classes(config: Config, source: Path) -> None:
+    """Raises InputError, naming the source, for a class that validation cannot score."""
+    for k, entry in enumerate(config.head.classes):
+        if entry.name not in CLASSES:
+            where = f"{source}: head.classes[{k}].name"
+            raise InputError(f"{where}: unknown class '{entry.name}'; known are {', '.join(CLASSES)}")
+
+
 def choose_out(given: str | None, config: Path, resume: bool) -> Path:
     """The run's folder: the one given, or runs/NAME, runs/NAME-2, ... after the config."""
     if given is not None:
@@ -633,10 +641,7 @@ def main(arguments: Sequence[str] | None) -> None:
     options = parser.parse_args(arguments)
 
     config = load_config(options.config, options.set)
-    for k, entry in enumerate(config.head.classes):
-        if entry.name not in CLASSES:
-            where = f"{options.config}: head.classes[{k}].name"
-            raise InputError(f"{where}: unknown class '{entry.name}'; known are {', '.join(CLASSES)}")
+    check_classes(config, options.config)
     device = ranks.start(select_device(options.device))
     out = ranks.of_first(choose_out(options.out, options.config, options.resume) if ranks.rank() == 0 else None)
     if ranks.rank() == 0:

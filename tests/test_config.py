@@ -299,7 +299,7 @@ def test_a_file_is_laid_over_its_base(tmp_path: Path, tree: dict[str, Any]) -> N
         ("base: b.yaml", r"a\.yaml: base: is its own base"),
         ("base: good.yaml\nhead: {classes: {Truck: null}}", r"a\.yaml: head\.classes\.Truck: no such entry below"),
         ("base: good.yaml\nencoder: {vfe: dense}", r"a\.yaml: encoder\.vfe: want one of attentive, plain, pillar"),
-        ("base: good.yaml\nencoder: {vfe: pillar}", r"a\.yaml: encoder\.projection_scales: want \[1\.0\] for pillars"),
+        ("base: good.yaml\nencoder: {vfe: pillar}", r"a\.yaml: encoder\.feature_scales: want \[1\.0\] for pillars"),
         ("base: good.yaml\nencoder: {voxel_limit: 9}", r"a\.yaml: encoder\.voxel_limit: want a point_limit beside"),
         ("base: good.yaml\nencoder: {point_limit: -1}", r"a\.yaml: encoder\.point_limit: want 0 \(none\) or more"),
         ("base: good.yaml\nbackbone: {stride: 2}", r"a\.yaml: backbone\.stride: want 1 where a second image joins"),

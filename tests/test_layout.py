@@ -51,7 +51,7 @@ ALLOWED = {f"kernels.{name}": allowed for name, allowed in KERNELS.items()} | {
     "weights.__main__": {"data.database", "model", "train"},
     "train": NETWORK | DATA | {"model", "detector", "draw", "evaluate", "ranks"},
     "detect": NETWORK | DATA | {"model", "detector", "draw", "evaluate"},
-    "study": ANY_KERNEL | NETWORK | DATA | {"model", "detector", "evaluate", "train"},
+    "study": ANY_KERNEL | NETWORK | DATA | {"model", "detector", "evaluate", "matching", "train"},
 }
 
 

@@ -7,9 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from hvnet.config import load_config
+from hvnet.anchors import assign_targets
+from hvnet.config import LossConfig, load_config
+from hvnet.head import HeadMaps
 from hvnet.kernels.rotated import rotated_iou_bev
-from hvnet.loss import iou_pairs
+from hvnet.loss import class_loss, iou_pairs
 from hvnet.model import HVNet
 from tests.test_config import CONFIGS
 
@@ -67,6 +69,26 @@ def test_gradients_of_equal_and_of_distant_boxes_are_finite() -> None:
         iou_pairs(box(0, 0, 4, 2), moved, generalized=True).sum().backward()
         assert moved.grad is not None
         assert moved.grad.isfinite().all()
+
+
+def test_iou_losses_of_a_class_by_hand() -> None:
+    """One positive anchor: 1 - IoU = 2/5, 1 - GIoU, and the branch, whose target is the IoU of 3/5."""
+    entry = load_config(CONFIGS / "demo.yaml").head.classes[0]
+    anchors = torch.tensor([[0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], [50.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]])
+    targets = assign_targets(anchors, [torch.tensor([[1.0, 1.0, 0.0, 4.0, 2.0, 1.5, 0.0]])], 0.2, 0.1)
+    assert targets.positive.tolist() == [[True, False]]
+    location = torch.zeros(1, 2, 8)
+    location[..., 0::2] = 1.0
+    location[..., 1::2] = 0.5  # the box stands at (1, 0.5): 4 x 1.5 of 4 x 2.5 are shared
+    maps = HeadMaps(torch.zeros(1, 2), location, torch.zeros(1, 2, 2), None, torch.tensor([[2.0, -3.0]]))
+    weights = LossConfig(localization=2.0, iou=3.0)
+    terms = class_loss(maps, targets, entry, dataclasses.replace(weights, box="iou"))
+    assert terms["localization"].item() == pytest.approx(2.0 * (1 - 6 / 10), abs=1e-5)
+    branch = math.log(1 + math.exp(2.0)) - 2.0 * 6 / 10  # cross-entropy of the logit 2 with the target 0.6
+    assert terms["iou"].item() == pytest.approx(3.0 * branch, abs=1e-5)
+    location[..., 0::2] = 3.0  # at (3, 0.5): 2 x 1.5 shared, 13 covered, 6 x 2.5 enclosed
+    terms = class_loss(maps, targets, entry, dataclasses.replace(weights, box="giou"))
+    assert terms["localization"].item() == pytest.approx(2.0 * (1 - (3 / 13 - 2 / 15)), abs=1e-5)
 
 
 def test_learnt_weights_by_hand() -> None:

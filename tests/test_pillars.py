@@ -8,7 +8,8 @@ from torch import Tensor
 
 from hvnet.config import load_config
 from hvnet.data.kitti import read_frame
-from hvnet.kernels.voxel import make_grid
+from hvnet.kernels import reference
+from hvnet.kernels.voxel import is_nested, make_grid
 from hvnet.model import HVNet
 from hvnet.pillars import PillarEncoder, hard_voxels
 from tests.test_config import CONFIGS
@@ -41,6 +42,20 @@ def test_the_first_points_of_the_first_voxels(point_limit: int, voxel_limit: int
         assert own.index(k % len(TABLE)) == place
         assert at // 16 == k // len(TABLE)
     assert hard.voxel.max() + 1 == len(hard.cursor) == len(set(cursor.tolist()))
+
+
+def test_limits_where_the_index_is_hashed() -> None:
+    """A grid of more than 2^31 squares' worth of keys: of every voxel the first point, whatever the index."""
+    grid = make_grid((0.0, 0.0, -3.0, 8000.0, 20.0, 2.0), (0.1, 0.1), 1.0)
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(300, 4, generator=generator) * torch.tensor([2.0, 2.0, 1.0, 1.0])
+    assert not is_nested([grid], 1)
+    hard = hard_voxels(points, torch.zeros(300, dtype=torch.int64), 1, grid, 1, 0)
+    first = {}
+    for k, at in enumerate(reference.cursors(points, torch.zeros(300, dtype=torch.int64), grid).tolist()):
+        first.setdefault(at, k)
+    assert hard.place.tolist() == [0] * len(first)
+    assert sorted(hard.point.tolist()) == sorted(first.values())
 
 
 def usual(encoder: PillarEncoder, points: Tensor) -> Tensor:

@@ -3,6 +3,12 @@
 import csv
 import json
 import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +21,7 @@ from hvnet.cli import InputError
 from hvnet.config import load_config
 from hvnet.data.kitti import read_frame, read_split
 from hvnet.detector import Detector
-from hvnet.model import HVNet
+from hvnet.model import Detections, HVNet, load_checkpoint
 from hvnet.study import STUDIES, Outcome, Row, agreement, main, with_budget
 from tests.test_config import CONFIGS
 
@@ -114,8 +120,13 @@ def test_the_scale_rows() -> None:
 
 
 def outcome(row: str, seed: int, ap: float) -> Outcome:
-    scores = {name: {"bev": [ap] * 3, "3d": [ap] * 3, "aos": [ap] * 3} for name in ("Car", "Pedestrian")}
-    return Outcome(Row(row, row), seed, Path(), 1, 1.0, 1, 0.0, scores, None)
+    """Two classes whose moderate BEV AP are ap - 1 and ap + 1, and one that the frames do not hold."""
+    scores = {
+        "Car": {"bev": [0.0, ap - 1, 0.0], "3d": [7.0] * 3, "aos": [8.0] * 3},
+        "Pedestrian": {"bev": [90.0, ap + 1, 0.0], "3d": [7.0] * 3, "aos": [8.0] * 3},
+        "Cyclist": {measure: [None] * 3 for measure in ("bev", "3d", "aos")},
+    }
+    return Outcome(Row(row, row), seed, Path(), 1, 1.0, 1, "cpu", 0.0, scores)
 
 
 def test_agreement_of_seeds() -> None:
@@ -124,6 +135,40 @@ def test_agreement_of_seeds() -> None:
     second = {"a": 4.0, "b": 2.0, "c": 9.0}
     outcomes = [outcome(row, seed, values[row]) for seed, values in enumerate((first, second)) for row in "abc"]
     assert agreement(outcomes) == (2, 3, 1.0)
+    assert outcomes[0].mean_ap() == 1.0
+    assert outcomes[0].mean_ap(level=0) == 45.0
+    even = [outcome(row, seed, 5.0) for seed in range(2) for row in "ab"]
+    assert agreement(even) == (0, 1, 0.0)  # a tie is no order
+    empty = outcome("a", 0, 5.0)._replace(scores={"Car": {"bev": [None] * 3}})
+    assert agreement([empty])[:2] == (0, 0)
+
+
+def test_score_counts_objects_in_range(scenes: Path) -> None:
+    """A detector that says what is labelled scores 100, also if it knows nothing of what lies beyond its range."""
+    config = load_config(CONFIGS / "studies" / "base.yaml", ["encoder.point_range=[0, -12.8, -3, 15, 12.8, 2]"])
+    ids = read_split(scenes, "val")
+    frames = iter([read_frame(scenes, name) for name in ids] * 2)
+    classes = ["Car", "Pedestrian", "Cyclist"]
+
+    def detector(miss: int) -> Callable[[torch.Tensor], Detections]:
+        def detect(_: torch.Tensor) -> Detections:
+            frame = next(frames)
+            known = [k for k, name in enumerate(frame.names) if name in classes and frame.boxes[k, 0] < 15]
+            known = known[miss:]
+            labels = torch.tensor([classes.index(frame.names[k]) for k in known])
+            return Detections(frame.boxes[known], torch.full((len(known),), 0.9), labels)
+
+        detect.config, detect.classes = config, classes  # type: ignore[attr-defined]
+        return detect
+
+    scores = study.score(detector(0), scenes, ids)  # type: ignore[arg-type]
+    figures = [value for table in scores.values() for value in table["bev"] if value is not None]
+    assert len(figures) > 3
+    assert figures == pytest.approx([100.0] * len(figures))
+    worse = study.score(detector(2), scenes, ids)  # type: ignore[arg-type]
+    assert sum(table["bev"][2] or 0.0 for table in worse.values()) < 290
+    cars = study.count_cars(config, scenes, ids)
+    assert 0 < cars < sum(frame.names.count("Car") for frame in (read_frame(scenes, name) for name in ids)) + 1
 
 
 @pytest.mark.parametrize(
@@ -167,8 +212,10 @@ def test_a_study_is_written_and_goes_on(
     table = (tmp_path / "density.md").read_text()
     assert table in out
     assert max(len(line) for line in table.splitlines() if line.startswith("|")) < 160
-    assert re.search(r"\| every point \|.*\| 0\.0 \|.*\| 1\.00 \|", table)
-    assert re.search(r"The 2 seeds agree on the order of [01] of 1 pairs of rows", table)
+    assert re.search(r"\| every point \|.*\| 0\.0 \| 0\.0 \|.*\| 1\.00 \|", table)
+    assert re.search(r"\| 8 points a voxel \|.*\d\* \|", table)  # is not fused
+    assert re.search(r"All 2 seeds agree on the order of [01] of 1 pairs of rows", table)
+    assert re.search(r"Real: 2 frames, which hold \d+ moderate cars", table)
     with (tmp_path / "density.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [(row["row"], row["seed"], row["steps"]) for row in rows] == [
@@ -178,12 +225,20 @@ def test_a_study_is_written_and_goes_on(
         ("limit-8", "1", "2"),
     ]
     assert 0.01 < float(rows[2]["dropped"]) < 0.9
-    assert rows[0]["Car bev"] == rows[0]["real Car bev"]  # the same frames
+    assert rows[2]["dropped"] == rows[2]["real dropped"]  # the same frames
     assert {row["train frames"] for row in rows} == {"4"}
     with Image.open(tmp_path / "density.png") as picture:
         assert picture.size[0] > 400
-    for file in (tmp_path / "rows").glob("*/result.json"):
-        assert json.loads(file.read_text())["steps"] == 2
+    files = sorted((tmp_path / "rows").glob("*/result.json"))
+    assert [json.loads(file.read_text())["steps"] for file in files] == [2] * 4
+    files[0].write_text("")  # damaged: scored again from its checkpoint, which is whole; another row is left out
+    main([*arguments(tmp_path, "--data", str(scenes), "--budget", "steps=2"), "--rows", "limit-8"])
+    assert "[2/2] density/limit-8, seed 1" in capsys.readouterr().out
+    assert "| every point |" in (tmp_path / "density.md").read_text()  # of a row not named: what there is
+    other = shutil.copytree(scenes, tmp_path / "elsewhere" / scenes.name)  # other data under the same name
+    count = len(trained)
+    main(arguments(tmp_path, "--data", str(other), "--budget", "steps=2", "--seeds", "1"))
+    assert len(trained) == count + 2
 
 
 def test_speed_is_labelled_with_the_devices(tmp_path: Path, scenes: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -203,7 +258,7 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     for name, each in STUDIES.items():
         assert f"\n{name}\n  shows  {each.shows}\n" in "\n" + out
-    assert "8 rows a seed, each 600 steps of 2 generated scenes" in out
+    assert "8 rows of 600 steps: about 16 minutes a seed" in out
     assert max(map(len, out.splitlines())) <= 120
 
 
@@ -216,8 +271,40 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
         (["loss", "--base", "none.yaml"], r"none\.yaml: cannot be read"),
         (["loss", "--set", "head.iou"], "--set head.iou: want KEY=VALUE"),
         (["loss", "--data", "nowhere"], r"nowhere/ImageSets/train\.txt"),
+        (["loss", "--validate", "nowhere"], r"nowhere/ImageSets/val\.txt"),
+        (["loss", "--base", str(CONFIGS / "hvnet.yaml")], r"hvnet\.yaml: has no key synthetic"),
+        (["speed", "--budget", "steps=1"], "--budget: is not for speed"),
     ],
 )
 def test_mistakes(given: list[str], message: str, tmp_path: Path) -> None:
+    scenes = [] if "--base" in given else ["--set", "synthetic={train_frames: 1, val_frames: 1}"]
     with pytest.raises(InputError, match=message):
-        main([*given, "--out", str(tmp_path / "out"), "--set", "synthetic={train_frames: 1, val_frames: 1}"])
+        main([*given, "--out", str(tmp_path / "out"), *scenes])
+
+
+def test_one_study_at_a_time(tmp_path: Path) -> None:
+    with study.locked(tmp_path), pytest.raises(InputError, match="another study is at work there"):
+        main(["speed", "--out", str(tmp_path)])
+
+
+def test_a_study_that_is_stopped_goes_on(tmp_path: Path, scenes: Path) -> None:
+    """SIGTERM in the middle of a row: it says so, ends, and the same command ends with the row of a run in one go."""
+    given = ["loss", "--rows", "corners", "--seeds", "1", "--data", str(scenes), "--device", "cpu", "--budget"]
+    given += ["epochs=12", *(part for each in (*SMALL, *QUICK) for part in ("--set", each))]
+    command = [sys.executable, "-m", "hvnet.study", *given, "--out", str(tmp_path / "a")]
+    process = subprocess.Popen(
+        command, cwd=CONFIGS.parent, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    while process.poll() is None and not list((tmp_path / "a" / "rows").glob("*/checkpoint.pt")):
+        time.sleep(0.1)
+    process.send_signal(signal.SIGTERM)
+    out, _ = process.communicate(timeout=120)
+    assert process.returncode == 128 + signal.SIGTERM
+    assert "stopped; the same command goes on from here" in out
+    main([*given, "--out", str(tmp_path / "a")])
+    main([*given, "--out", str(tmp_path / "b")])
+    stopped, whole = (json.loads(next((tmp_path / at).glob("rows/*/result.json")).read_text()) for at in "ab")
+    assert stopped["scores"] == whole["scores"]
+    assert stopped["seconds"] is None
+    weights = [load_checkpoint(next((tmp_path / at).glob("rows/*/checkpoint.pt")))["model"] for at in "ab"]
+    assert all(torch.equal(a, b) for a, b in zip(weights[0].values(), weights[1].values(), strict=True))
