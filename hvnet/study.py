@@ -418,7 +418,7 @@ def draw_trained(path: Path, name: str, outcomes: Sequence[Outcome], times: dict
         axes.invert_yaxis()
         axes.grid(axis="x", alpha=0.3)
         axes.set_xlabel("BEV mAP, moderate (%)")
-        axes.legend(handles=handles, fontsize=8)
+        figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     figure.suptitle(f"{name}: {study.shows}", fontsize=10)
     figure.savefig(path, dpi=110)
 
