@@ -26,12 +26,13 @@ from hvnet.data.kitti import (
     boxes_to_camera,
     detections_to_labels,
     read_frame,
+    read_image,
     read_labels,
     read_split,
     write_labels,
 )
 from hvnet.detector import Detector, load
-from hvnet.draw import draw_bev
+from hvnet.draw import Camera, Subject, draw_bev, draw_frame
 from hvnet.evaluate import CLASSES, evaluate, format_table
 from hvnet.model import Detections
 
@@ -134,6 +135,14 @@ def read_source(source: Source, classes: Sequence[str]) -> Cloud:
     return Cloud(frame.points, truth, frame.calib, frame.image_size, [frame.note] if frame.note else [])
 
 
+def camera_of(source: Source, cloud: Cloud) -> Camera | None:
+    """The camera of a KITTI frame with its image, where there is one; None for other clouds."""
+    if cloud.calib is None:
+        return None
+    path = source.kitti_file("image_2", ".png")
+    return Camera(cloud.calib, cloud.image_size, None if path is None else read_image(path))
+
+
 def result_rows(found: Detections, cloud: Cloud, classes: Sequence[str]) -> Labels:
     """The rows of a KITTI result file. Without calibration the 2D boxes are -1 and the camera stands at the LiDAR.
 
@@ -228,9 +237,13 @@ def detect(detector: Detector, sources: Sequence[Source], out: Path, pictures: i
                 table.writerow(["cloud", "class", "score", "x", "y", "z", "length", "width", "height", "yaw"])
             table.writerows(csv_rows(source.name, found, detector.classes))
         if k < pictures:
-            point_range = detector.config.encoder.point_range
-            path = out / "pictures" / f"{source.name}.png"
-            draw_bev(path, cloud.points, point_range, cloud.truth, *found, detector.classes, source.name)
+            path, point_range = out / "pictures" / f"{source.name}.png", detector.config.encoder.point_range
+            subject = Subject(cloud.points, cloud.truth, *found, detector.classes)
+            camera = camera_of(source, cloud)
+            if camera is not None and camera.image is not None:
+                draw_frame(path, subject, point_range, camera, source.name)
+            else:
+                draw_bev(path, subject, point_range, source.name)
         total += len(found.boxes)
     if submit:
         write_submission(out / "submission.zip", out / "results")
@@ -242,8 +255,8 @@ def main(arguments: Sequence[str] | None) -> None:
     parser = make_parser(
         "detect",
         "Detects objects in point clouds; writes KITTI result files (results/), all boxes in LiDAR axes (boxes.csv) "
-        "and bird's eye views (pictures/). Where every cloud is a KITTI frame with labels, the results are scored. "
-        "--split test writes submission.zip for the KITTI server.",
+        "and bird's eye views (pictures/), which KITTI frames have below their image. Where every cloud is a KITTI "
+        "frame with labels, the results are scored. --split test writes submission.zip for the KITTI server.",
         [
             "cloud.bin",
             "cloud.pcd --checkpoint runs/demo/checkpoint.pt",

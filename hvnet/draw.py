@@ -1,85 +1,372 @@
-"""Pictures, drawn without a screen."""
+"""Pictures, drawn without a screen: clouds with boxes from above and in the camera's image, and pseudo-images.
 
-from collections.abc import Sequence
+`show_*` draw into matplotlib axes, `draw_*` write a file: .png, or .svg and .pdf, in which the points are a raster.
+"""
+
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Literal, NamedTuple
 
+import matplotlib
+import numpy as np
 import torch
-from matplotlib.collections import LineCollection
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PathCollection, PolyCollection
+from matplotlib.colors import AsinhNorm, to_rgba
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 from torch import Tensor
 
-from hvnet.boxes import bev_corners
+from hvnet.boxes import bev_corners, box_corners
+from hvnet.data.kitti import EDGES, NEAR, Calibration, Floats, in_image, project_boxes
 
+FORMATS = ("png", "svg", "pdf")
 TRUTH_COLOUR = "#1a9850"
 SHOWN_SCORE = 0.5
 """Detections below are left out of pictures, which they would only fill."""
 CLASS_COLOURS = ("#d62728", "#1f77b4", "#ff7f0e", "#9467bd")
+FRONT = [0, 1, 5, 4]
+"""A box's face in front, in the order of box_corners."""
+WIDTH = 8.0
+"""Of a picture, in inches."""
+
+Colour = Literal["height", "reflectance"]
 
 
-def draw_bev(
-    path: Path,
-    points: Tensor,
-    point_range: Sequence[float],
-    truth: Tensor,
-    boxes: Tensor,
-    scores: Tensor,
-    labels: Tensor,
-    classes: Sequence[str],
-    title: str,
-) -> None:
-    """Writes a bird's eye view: points (N, 4) coloured by height, true boxes (T, 7) and detections (M, 7).
+class Subject(NamedTuple):
+    """What a picture shows, in LiDAR axes."""
 
-    A line from each box's centre to its front shows the heading; detections carry their scores (M,), and labels (M,)
-    index the class names; those of scores below SHOWN_SCORE are not drawn, nor boxes whose centre is outside the range.
-    """
-    truth = truth[_is_near(truth, point_range)]
-    shown = (scores >= SHOWN_SCORE) & _is_near(boxes, point_range)
-    boxes, scores, labels = boxes[shown], scores[shown], labels[shown]
-    x_min, y_min, z_min, x_max, y_max, z_max = point_range
-    inside = (points[:, 0] >= x_min) & (points[:, 0] < x_max) & (points[:, 1] >= y_min) & (points[:, 1] < y_max)
-    x, y, z = points[inside, :3].cpu().numpy().T
-    width = 8.0
-    height = min(max(width * (x_max - x_min) / (y_max - y_min), 2.0), 50.0)  # inches; matplotlib has its limits
-    figure = Figure(figsize=(width, 0.9 + height), layout="constrained")
+    points: Tensor  # (N, 4) x, y, z, reflectance
+    truth: Tensor  # (T, 7) labelled boxes
+    boxes: Tensor  # (M, 7) detections
+    scores: Tensor  # (M,)
+    labels: Tensor  # (M,) index into the classes
+    classes: Sequence[str]
+
+    def at_score(self, score: float) -> "Subject":
+        """Without the detections below a score."""
+        shown = self.scores >= score
+        return self._replace(boxes=self.boxes[shown], scores=self.scores[shown], labels=self.labels[shown])
+
+
+class Camera(NamedTuple):
+    """Where the camera stands, and what it saw."""
+
+    calib: Calibration
+    size: tuple[int, int]  # width, height in pixels
+    image: NDArray[np.uint8] | None  # (H, W, 3), None where there is none
+
+
+class Features(NamedTuple):
+    """The pseudo-images of a model for one cloud."""
+
+    name: str  # of the model
+    images: Sequence[Tensor]  # (B, C, N_L, N_W) each, of which the first sample is drawn
+    cells: Sequence[tuple[float, float]]  # length and width of a cell of each image, in metres
+    corner: tuple[float, float]  # least x and y of all images, in metres
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
+
+
+def draw_bev(path: Path, subject: Subject, point_range: Sequence[float], title: str, colour: Colour = "height") -> None:
+    """Writes a bird's eye view of a range (x, y, z least, x, y, z greatest) with detections from SHOWN_SCORE on."""
+    figure = Figure(figsize=(WIDTH, 0.9 + _bev_height(point_range)), layout="constrained")
     axes = figure.add_subplot()
-    axes.scatter(-y, x, s=0.4, c=z, cmap="viridis", vmin=z_min, vmax=min(z_max, 1.0), linewidths=0)
-    handles = []
-    if len(truth):
-        handles.append(axes.add_collection(_outlines(truth, TRUTH_COLOUR, 2.2, f"labelled ({len(truth)})")))
-    for label, name in enumerate(classes):
-        own = labels == label
-        if own.any():
-            colour = CLASS_COLOURS[label % len(CLASS_COLOURS)]
-            handles.append(axes.add_collection(_outlines(boxes[own], colour, 1.2, f"{name} ({int(own.sum())})")))
-            for box, score in zip(boxes[own].tolist(), scores[own].tolist(), strict=True):
-                reach = max(box[3], box[4]) / 2
-                axes.text(
-                    -box[1], box[0] + reach + 0.3, f"{score:.2f}", color=colour, fontsize=6, ha="center", clip_on=True
-                )
+    _whole_bev(axes, subject.at_score(SHOWN_SCORE), point_range, colour)
+    axes.set_title(f"{title}, score ≥ {SHOWN_SCORE}")
+    _write(figure, path, dpi=110)
+
+
+def draw_frame(
+    path: Path,
+    subject: Subject,
+    point_range: Sequence[float],
+    camera: Camera,
+    title: str,
+    colour: Colour = "height",
+) -> None:
+    """Writes the camera's picture above and the bird's eye view below, with detections from SHOWN_SCORE on."""
+    heights = (0.92 * WIDTH * camera.size[1] / camera.size[0], 0.92 * _bev_height(point_range))  # labels take the rest
+    figure = Figure(figsize=(WIDTH, 1.0 + sum(heights)), layout="compressed")
+    above, below = figure.subplots(2, 1, height_ratios=heights)
+    subject = subject.at_score(SHOWN_SCORE)
+    points = show_camera(above, subject, camera)
+    if points is not None:
+        _colour_bar(points, above.inset_axes((0.77, 0.91, 0.2, 0.03)), "depth (m)")
+    above.set_title(f"{title}, score ≥ {SHOWN_SCORE}")
+    _whole_bev(below, subject, point_range, colour)
+    _write(figure, path, dpi=150)
+
+
+def draw_features(path: Path, models: Sequence[Features], title: str) -> None:
+    """Writes the pseudo-images of one or several models: a row for each projection scale, finest first.
+
+    The columns are the first channel of every model, as in the paper, then the norm over the channels.
+    """
+    rows = max(len(model.images) for model in models)
+    width = max(3.4 * 2 * len(models), WIDTH)
+    figure = Figure(figsize=(width, 0.5 + 3.2 * rows), layout="compressed")
+    axes = figure.subplots(rows, 2 * len(models), squeeze=False)
+    for axis in axes.flat:
+        axis.axis("off")
+    for at, model in enumerate(models):
+        for row, (image, cell) in enumerate(zip(model.images, model.cells, strict=True)):
+            channels = image[0].detach().float().cpu()  # (C, N_L, N_W)
+            for column, values in ((at, channels[0]), (len(models) + at, channels.norm(dim=0))):
+                _show_feature(axes[row, column], values, cell, model.corner, column < len(models))
+                what = "first channel" if column < len(models) else "norm"
+                lines = f"{model.name}\n" if len(models) > 1 else ""
+                axes[row, column].set_title(f"{lines}{what}, cells of {cell[0]:g} m", fontsize=9)
+    figure.suptitle(title)
+    _write(figure, path, dpi=110)
+
+
+def _show_feature(
+    axes: Axes, values: Tensor, cell: tuple[float, float], corner: tuple[float, float], signed: bool
+) -> None:
+    """An image (N_L, N_W) as seen from above, up to the 99.5th percentile of what is not zero.
+
+    Below their median the values are coloured linearly, above by their logarithm: few cells hold the greatest.
+    """
+    length, width = (count * size for count, size in zip(values.shape, cell, strict=True))
+    x, y = corner
+    known = values[values != 0].abs().numpy()
+    median, most = np.percentile(known, (50, 99.5)) if len(known) else (1.0, 1.0)
+    image = axes.imshow(
+        values.flip(1).numpy(),
+        origin="lower",
+        extent=(-(y + width), -y, x, x + length),
+        cmap="RdBu_r" if signed else "magma",
+        norm=AsinhNorm(median, -most if signed else 0.0, most),
+        interpolation="nearest" if max(values.shape) < 300 else "antialiased",
+    )
+    axes.axis("on")
+    axes.tick_params(labelsize=7)
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    ticks = [0, median, most]
+    bar = figure.colorbar(image, ax=axes, shrink=0.8, pad=0.02, ticks=[-most, -median, *ticks] if signed else ticks)
+    bar.ax.yaxis.set_major_formatter("{x:.2g}")
+    bar.ax.tick_params(labelsize=7)
+    bar.minorticks_off()
+
+
+# --- from above -------------------------------------------------------------------------------------------------------
+
+
+def show_bev(axes: Axes, subject: Subject, point_range: Sequence[float], colour: Colour = "height") -> PathCollection:
+    """Draws a bird's eye view, x up and y to the left: points, boxes with their heading, and rings of distance.
+
+    A line from each box's centre to its front shows the heading; detections carry their scores. Boxes whose centre is
+    outside the range are not drawn. Returns the points.
+    """
+    x_min, y_min, z_min, x_max, y_max, z_max = point_range
+    points = subject.points.cpu()
+    inside = (points[:, 0] >= x_min) & (points[:, 0] < x_max) & (points[:, 1] >= y_min) & (points[:, 1] < y_max)
+    x, y, z, reflectance = points[inside].numpy().T
+    values, limits = (z, (z_min, min(z_max, 1.0))) if colour == "height" else (reflectance, (0.0, 1.0))
+    scattered = _scatter(axes, -y, x, values, limits, "cividis_r", 2.2 * WIDTH / (x_max - x_min + y_max - y_min) * 4)
+    _rings(axes, point_range)
+    for boxes, texts, tint, width, label in _groups(subject, point_range):
+        axes.add_collection(_outlines(boxes, tint, width, f"{label} ({len(boxes)})"))
+        top = bev_corners(boxes)[..., 0].amax(dim=1)
+        for x, y, text in zip((top + 0.3).tolist(), boxes[:, 1].tolist(), texts, strict=True):
+            _write_text(axes, -y, x, text, tint, "bottom")
     axes.set_xlim(-y_max, -y_min)
     axes.set_ylim(x_min, x_max)
     axes.set_aspect("equal")
     axes.set_xlabel("to the right (m)")
     axes.set_ylabel("forward (m)")
-    axes.set_title(f"{title}, score ≥ {SHOWN_SCORE}")
-    if handles:
-        axes.legend(handles=handles, loc="upper right", fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    return scattered
 
 
-def _is_near(boxes: Tensor, point_range: Sequence[float]) -> Tensor:
-    """Which boxes (M, 7) have their centre in the range and a size that can be drawn."""
-    low, high = boxes.new_tensor(point_range).view(2, 3)[:, :2]
-    inside = ((boxes[:, :2] >= low) & (boxes[:, :2] < high)).all(dim=1)
-    return inside & (boxes[:, 3:5] < 10 * (high - low).max()).all(dim=1)
+def _whole_bev(axes: Axes, subject: Subject, point_range: Sequence[float], colour: Colour) -> None:
+    """A bird's eye view with a legend, and a bar of its colours in the corner that the camera does not see."""
+    points = show_bev(axes, subject, point_range, colour)
+    _colour_bar(points, axes.inset_axes((0.03, 0.05, 0.2, 0.012)), "height (m)" if colour == "height" else colour)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="upper right", fontsize=8)
+
+
+def _bev_height(point_range: Sequence[float]) -> float:
+    x_min, y_min, _, x_max, y_max, _ = point_range
+    return min(max(WIDTH * (x_max - x_min) / (y_max - y_min), 2.0), 50.0)  # inches; matplotlib has its limits
+
+
+def _rings(axes: Axes, point_range: Sequence[float]) -> None:
+    """Circles around the sensor, each with its radius where it passes on the left of the range's middle."""
+    x_min, y_min, _, x_max, y_max, _ = point_range
+    far = np.hypot(max(abs(x_min), abs(x_max)), max(abs(y_min), abs(y_max)))
+    middle = (x_min + x_max) / 2, (y_min + 3 * y_max) / 4
+    away = np.hypot(*middle) or 1.0
+    for radius in MaxNLocator(nbins=8, steps=[1, 2, 5, 10]).tick_values(0, far):
+        if 0 < radius <= far:
+            axes.add_patch(Circle((0, 0), radius, fill=False, color="#888888", linewidth=0.5, zorder=0.5))
+            x, y = radius * middle[0] / away, radius * middle[1] / away
+            margin = 0.03 * (x_max - x_min), 0.05 * (y_max - y_min)
+            if x_min + margin[0] < x < x_max - margin[0] and y_min + margin[1] < y < y_max - margin[1]:
+                _write_text(axes, -y, x, f"{radius:g} m", "#555555", "center")
 
 
 def _outlines(boxes: Tensor, colour: str, width: float, label: str) -> LineCollection:
     """Outline and heading of boxes (M, 7), as they are seen from above with x up and y to the left."""
-    corners = bev_corners(boxes.cpu())  # (M, 4, 2)
-    centre, front = boxes[:, None, :2].cpu(), corners[:, :2].mean(dim=1, keepdim=True)
+    corners = bev_corners(boxes)  # (M, 4, 2)
+    centre, front = boxes[:, None, :2], corners[:, :2].mean(dim=1, keepdim=True)
     outlines = torch.cat((corners, corners[:, :1]), dim=1)
     headings = torch.cat((centre, front), dim=1)
     lines = [line.flip(-1).mul(line.new_tensor([-1.0, 1.0])).numpy() for line in (*outlines, *headings)]
     return LineCollection(lines, colors=colour, linewidths=width, label=label)
+
+
+# --- in the image -----------------------------------------------------------------------------------------------------
+
+
+def show_camera(axes: Axes, subject: Subject, camera: Camera) -> PathCollection | None:
+    """Draws the camera's image with the boxes: edges, the face in front tinted, and the 2D box dotted.
+
+    Without an image the points are drawn and returned, coloured by their depth. Nothing is drawn of what is behind the
+    camera or outside the image.
+    """
+    width, height = camera.size
+    drawn = None
+    if camera.image is not None:
+        axes.imshow(camera.image, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
+    else:
+        points = subject.points.cpu().numpy()
+        points = points[in_image(points, camera.calib, camera.size)]
+        pixels, depth = camera.calib.project(points[:, :3])
+        drawn = _scatter(axes, pixels[:, 0], pixels[:, 1], depth, (0.0, 60.0), "turbo", 1.5)
+        axes.set_aspect("equal")
+    for boxes, texts, tint, line_width, label in _groups(subject):
+        values = boxes.double().numpy()
+        corners = box_corners(boxes.double()).numpy()  # (M, 8, 3)
+        begin, end = corners[:, EDGES[:, 0]].reshape(-1, 3), corners[:, EDGES[:, 1]].reshape(-1, 3)
+        lines, _ = project_lines(begin, end, camera.calib, camera.size)
+        halo = [withStroke(linewidth=line_width + 1.2, foreground=(1, 1, 1, 0.55))] if camera.image is not None else []
+        edges = LineCollection(list(lines), colors=tint, linewidths=line_width, label=label, path_effects=halo)
+        axes.add_collection(edges)
+        fronts = [project_polygon(each[FRONT], camera.calib, camera.size) for each in corners]
+        axes.add_collection(PolyCollection([face for face in fronts if len(face)], facecolors=to_rgba(tint, 0.18)))
+        bbox, visible = project_boxes(values, camera.calib, camera.size)
+        rectangles = bbox[visible][:, [[0, 1], [2, 1], [2, 3], [0, 3]]]  # (V, 4, 2)
+        around = PolyCollection(list(rectangles), facecolors="none", edgecolors=tint, linewidths=0.7, linestyles=":")
+        axes.add_collection(around)
+        for k in np.flatnonzero(visible):
+            _write_text(axes, bbox[k, [0, 2]].mean(), bbox[k, 1] - 2, texts[k], tint, "bottom")
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    return drawn
+
+
+def project_lines(
+    begin: Floats, end: Floats, calib: Calibration, size: tuple[int, int]
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Pixels (K, 2, 2) of what the camera sees of lines from begin (S, 3) to end (S, 3), and which it sees (S,).
+
+    The lines are cut at the near plane and at the image's borders (Liang and Barsky 1984), all five of which are planes
+    through homogeneous pixels, before they are projected.
+    """
+    begin, end = calib.homogeneous(begin), calib.homogeneous(end)
+    a, b = _inside(begin, size), _inside(end, size)  # (S, 5)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = a / (a - b)
+    first = np.where((a < 0) & (b >= 0), share, 0).max(axis=1)[:, None]
+    last = np.where((a >= 0) & (b < 0), share, 1).min(axis=1)[:, None]
+    seen = ~((a < 0) & (b < 0)).any(axis=1) & (first < last)[:, 0]
+    parts = np.stack((begin + first * (end - begin), begin + last * (end - begin)), axis=1)[seen]  # (K, 2, 3)
+    return parts[..., :2] / parts[..., 2:], seen
+
+
+def project_polygon(corners: Floats, calib: Calibration, size: tuple[int, int]) -> Floats:
+    """Pixels (Q, 2) of what the camera sees of a convex polygon (P, 3), none if nothing (Sutherland and Hodgman)."""
+    polygon = calib.homogeneous(corners)
+    for plane in range(5):
+        values = _inside(polygon, size)[:, plane]
+        kept: list[Floats] = []
+        for k in range(len(polygon)):
+            before = k - 1
+            if (values[before] < 0) != (values[k] < 0):
+                share = values[before] / (values[before] - values[k])
+                kept.append(polygon[before] + share * (polygon[k] - polygon[before]))
+            if values[k] >= 0:
+                kept.append(polygon[k])
+        polygon = np.array(kept).reshape(-1, 3)
+    return polygon[:, :2] / polygon[:, 2:]
+
+
+def _inside(pixels: Floats, size: tuple[int, int]) -> Floats:
+    """Of homogeneous pixels (S, 3) how far inside they are of the near plane and the image's four borders: (S, 5)."""
+    width, height = size
+    u, v, depth = pixels.T
+    return np.column_stack((depth - NEAR, u, (width - 1) * depth - u, v, (height - 1) * depth - v))
+
+
+# --- for both ---------------------------------------------------------------------------------------------------------
+
+
+def _groups(
+    subject: Subject, point_range: Sequence[float] | None = None
+) -> Iterator[tuple[Tensor, list[str], str, float, str]]:
+    """Boxes (M, 7), their M scores as text, colour, width of line and name: the labels, then class by class."""
+    truth = subject.truth.cpu()
+    truth = truth[_is_drawable(truth, point_range)]
+    if len(truth):
+        yield truth, [""] * len(truth), TRUTH_COLOUR, 2.2, "labelled"
+    boxes, scores, labels = subject.boxes.cpu(), subject.scores.cpu(), subject.labels.cpu()
+    for label, name in enumerate(subject.classes):
+        own = (labels == label) & _is_drawable(boxes, point_range)
+        if own.any():
+            texts = [f"{score:.2f}" for score in scores[own].tolist()]
+            yield boxes[own], texts, CLASS_COLOURS[label % len(CLASS_COLOURS)], 1.2, name
+
+
+def _is_drawable(boxes: Tensor, point_range: Sequence[float] | None) -> Tensor:
+    """Which boxes (M, 7) have a size that can be drawn and, where there is a range, their centre in it."""
+    finite = boxes.isfinite().all(dim=1)
+    if point_range is None:
+        return finite
+    low, high = boxes.new_tensor(point_range).view(2, 3)[:, :2]
+    inside = ((boxes[:, :2] >= low) & (boxes[:, :2] < high)).all(dim=1)
+    return finite & inside & (boxes[:, 3:5] < 10 * (high - low).max()).all(dim=1)
+
+
+def _scatter(
+    axes: Axes,
+    x: NDArray[np.floating],
+    y: NDArray[np.floating],
+    values: NDArray[np.floating],
+    limits: tuple[float, float],
+    cmap: str,
+    size: float,
+) -> PathCollection:
+    return axes.scatter(
+        x, y, s=size, c=values, cmap=cmap, vmin=limits[0], vmax=limits[1], linewidths=0, rasterized=True, zorder=0.8
+    )
+
+
+def _colour_bar(points: PathCollection, place: Axes, label: str) -> None:
+    figure = place.get_figure(root=True)
+    assert figure is not None
+    figure.colorbar(points, cax=place, orientation="horizontal")
+    place.set_xlabel(label, fontsize=7, labelpad=1)
+    place.tick_params(labelsize=7)
+
+
+def _write_text(axes: Axes, x: float, y: float, text: str, colour: str, vertical: str) -> None:
+    if text:  # labels have no score
+        halo = [withStroke(linewidth=1.5, foreground="white")]
+        axes.text(x, y, text, color=colour, fontsize=6.5, ha="center", va=vertical, clip_on=True, path_effects=halo)
+
+
+def _write(figure: Figure, path: Path, dpi: float) -> None:
+    """Writes a figure in the format of the path's suffix, the same bits for the same figure."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    without_date = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(path.suffix)
+    with matplotlib.rc_context({"svg.hashsalt": "hvnet"}):
+        figure.savefig(path, dpi=dpi, metadata=without_date)

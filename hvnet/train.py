@@ -41,7 +41,7 @@ from hvnet.data.kitti import (
 )
 from hvnet.data.synthetic import Options, generate
 from hvnet.detector import Detector
-from hvnet.draw import draw_bev
+from hvnet.draw import Subject, draw_bev
 from hvnet.evaluate import CLASSES, evaluate, format_table
 from hvnet.model import HVNet, load_checkpoint, save_checkpoint, select_device
 
@@ -313,7 +313,8 @@ def validate(model: HVNet, root: Path, ids: list[str], pictures: Path, said: set
         if k < model.config.train.pictures:
             truth = frame.boxes[[n in classes for n in frame.names]]
             point_range = model.config.encoder.point_range
-            draw_bev(pictures / f"{name}.png", frame.points, point_range, truth, *found, classes, f"frame {name}")
+            subject = Subject(frame.points, truth, *found, classes)
+            draw_bev(pictures / f"{name}.png", subject, point_range, f"frame {name}")
     shares = ranks.gathered(found_here)
     both = [shares[k % len(shares)][k // len(shares)] for k in range(len(ids))]  # in the order of the frames
     return evaluate([labels for labels, _ in both], [rows for _, rows in both], classes=classes)

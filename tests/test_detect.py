@@ -222,6 +222,24 @@ def test_kitti_root(checkpoint: Path, scenes: Path, tmp_path: Path) -> None:
     assert len(list((tmp_path / "val" / "results").iterdir())) == 2
 
 
+def test_a_frame_with_an_image_has_it_in_its_picture(checkpoint: Path, scenes: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(scenes, tmp_path / "kitti"))
+    (root / "training" / "image_2").mkdir()
+    Image.new("RGB", (1242, 375), (255, 0, 255)).save(root / "training" / "image_2" / "000005.png")
+    detect(checkpoint, tmp_path / "out", root, options=("--split", "val"))
+    magenta = {}
+    for name in ("000004", "000005"):
+        with Image.open(tmp_path / "out" / "pictures" / f"{name}.png") as image:
+            magenta[name] = int((np.asarray(image.convert("RGB")) == [255, 0, 255]).all(axis=2).sum())
+    assert magenta["000004"] == 0
+    assert magenta["000005"] > 50_000
+    (root / "training" / "image_2" / "000005.png").write_bytes(
+        (root / "training" / "image_2" / "000005.png").read_bytes()[:100]
+    )
+    with pytest.raises(InputError, match=r"image_2.000005\.png: not an image, or cut off"):
+        detect(checkpoint, tmp_path / "again", root, options=("--split", "val"))
+
+
 def test_boxes_outside_the_image_are_in_the_table_alone(scenes: Path) -> None:
     calib = read_calibration(scenes / "training" / "calib" / "000000.txt")
     size = [4.0, 1.7, 1.5, 0.0]

@@ -44,7 +44,7 @@ ALLOWED = {f"kernels.{name}": allowed for name, allowed in KERNELS.items()} | {
     "data.synthetic": ANY_KERNEL | {"boxes", "data.kitti", "data.shapes"},
     "data.database": {"boxes", "data.kitti"},
     "data.augment": {"boxes", "config", "data.database"},
-    "draw": {"boxes"},
+    "draw": {"boxes", "data.kitti"},
     "matching": ANY_KERNEL | {"boxes", "data.kitti"},
     "evaluate": {"boxes", "matching", "data.kitti"},
     "mistakes": ANY_KERNEL | {"boxes", "data.kitti", "evaluate", "matching", "model"},

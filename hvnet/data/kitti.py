@@ -91,12 +91,12 @@ class Calibration:
 
         The pixel of a point that is not in front of the camera (depth <= 0) means nothing.
         """
-        projected = self._homogeneous(xyz)
+        projected = self.homogeneous(xyz)
         depth = projected[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             return projected[:, :2] / depth[:, None], depth
 
-    def _homogeneous(self, xyz: NDArray[np.floating]) -> Floats:
+    def homogeneous(self, xyz: NDArray[np.floating]) -> Floats:
         """Homogeneous pixels (N, 3) = (u * depth, v * depth, depth) of points (N, 3) in LiDAR axes."""
         rotation, shift = self._lidar_to_rectified()
         # coordinate by coordinate in memory, 7 times as fast as xyz @ matrix.T
@@ -337,7 +337,7 @@ def project_boxes(
     where its edges pass the near plane. It is visible if some of the 2D box lies in the image; else it is zero.
     """
     corners = box_corners(torch.from_numpy(boxes.astype(np.float64))).numpy()
-    corners = calib._homogeneous(corners.reshape(-1, 3)).reshape(-1, 8, 3)
+    corners = calib.homogeneous(corners.reshape(-1, 3)).reshape(-1, 8, 3)
     begin, end = corners[:, EDGES[:, 0]], corners[:, EDGES[:, 1]]  # (M, 12, 3)
     crosses = (begin[..., 2] < NEAR) != (end[..., 2] < NEAR)
     share = np.where(crosses, NEAR - begin[..., 2], 0) / np.where(crosses, end[..., 2] - begin[..., 2], 1)
@@ -382,6 +382,15 @@ def detections_to_labels(
         score=scores.detach().cpu().double().numpy(),
     )
     return labels.select(visible)
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """A picture (H, W, 3) in RGB. Raises InputError naming the file."""
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB"))
+    except OSError as error:
+        raise InputError(f"{path}: not an image, or cut off") from error
 
 
 def _image_size(path: Path) -> tuple[int, int]:
