@@ -47,6 +47,7 @@ ALLOWED = {f"kernels.{name}": allowed for name, allowed in KERNELS.items()} | {
     "draw": {"boxes", "data.kitti"},
     "matching": ANY_KERNEL | {"boxes", "data.kitti"},
     "evaluate": {"boxes", "matching", "data.kitti"},
+    "figures": DATA | {"detect", "detector", "draw"},
     "mistakes": ANY_KERNEL | {"boxes", "data.kitti", "evaluate", "matching", "model"},
     "weights.__init__": set(),
     "weights.__main__": {"data.database", "model", "train"},
