@@ -169,7 +169,7 @@ def show_bev(axes: Axes, subject: Subject, point_range: Sequence[float], colour:
     inside = (points[:, 0] >= x_min) & (points[:, 0] < x_max) & (points[:, 1] >= y_min) & (points[:, 1] < y_max)
     x, y, z, reflectance = points[inside].numpy().T
     values, limits = (z, (z_min, min(z_max, 1.0))) if colour == "height" else (reflectance, (0.0, 1.0))
-    scattered = _scatter(axes, -y, x, values, limits, "cividis_r", 2.2 * WIDTH / (x_max - x_min + y_max - y_min) * 4)
+    scattered = _scatter(axes, -y, x, values, limits, "cividis_r", 70 / (x_max - x_min + y_max - y_min))
     _rings(axes, point_range)
     for boxes, texts, tint, width, label in _groups(subject, point_range):
         axes.add_collection(_outlines(boxes, tint, width, f"{label} ({len(boxes)})"))

@@ -383,6 +383,7 @@ def train(config: Config, root: Path, out: Path, device: torch.device, resume: b
         if not resume:
             save(progress)  # a run that fails in its first epoch can go on
         keep_metrics(out / "metrics.jsonl", progress.epoch)
+        (out / "data.txt").write_text(f"{root.absolute()}\n", encoding="utf-8")
         board = SummaryWriter(str(out / "tensorboard"), purge_step=progress.epoch + 1)
     said: set[str] = set()
     joint = ranks.parallel(model)

@@ -48,6 +48,7 @@ ALLOWED = {f"kernels.{name}": allowed for name, allowed in KERNELS.items()} | {
     "matching": ANY_KERNEL | {"boxes", "data.kitti"},
     "evaluate": {"boxes", "matching", "data.kitti"},
     "figures": DATA | {"detect", "detector", "draw"},
+    "errors": ANY_KERNEL | {"data.kitti", "detector", "draw", "evaluate", "mistakes", "model"},
     "mistakes": ANY_KERNEL | {"boxes", "data.kitti", "evaluate", "matching", "model"},
     "weights.__init__": set(),
     "weights.__main__": {"data.database", "model", "train"},

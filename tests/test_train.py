@@ -134,7 +134,8 @@ def tiny() -> Config:
 
 def test_what_a_run_writes(trained: tuple[Path, str]) -> None:
     out, printed = trained
-    assert {path.name for path in out.iterdir()} == {"checkpoint.pt", "metrics.jsonl", "tensorboard", "pictures"}
+    written = {"checkpoint.pt", "metrics.jsonl", "data.txt", "tensorboard", "pictures"}
+    assert {path.name for path in out.iterdir()} == written
     assert printed.startswith("4 frames to train, 2 to validate, on cpu")
     for epoch, record in enumerate(metrics(out), 1):
         assert (record["epoch"], record["step"]) == (epoch, 2 * epoch)
