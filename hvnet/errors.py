@@ -193,8 +193,9 @@ def draw_crop(mistake: Mistake, subject: Subject, camera: Camera) -> bytes:
         left.add_patch(Rectangle(tuple(bbox[0, :2] - margin), wide, high, **dashed))
     canvas, file = FigureCanvasAgg(figure), io.BytesIO()
     canvas.draw()
-    # a palette takes a third of the bytes, and a page holds many crops
-    Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB").quantize(256).save(file, format="PNG")
+    # a palette takes a third of the bytes, and a page holds many crops; an octree's keeps the colours of thin lines
+    whole = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    whole.quantize(256, Image.Quantize.FASTOCTREE).save(file, format="PNG")
     return file.getvalue()
 
 

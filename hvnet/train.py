@@ -328,7 +328,7 @@ def share_of_rank(count: int) -> Iterable[int]:
 
 
 def train(config: Config, root: Path, out: Path, device: torch.device, resume: bool, signals: list[int]) -> None:
-    """Trains on a KITTI root, validates, and writes checkpoint.pt, metrics.jsonl, tensorboard/ and pictures/.
+    """Trains on a KITTI root, validates, and writes checkpoint.pt, metrics.jsonl, data.txt, tensorboard/, pictures/.
 
     If one of the `signals` comes, the run is saved after the step that is under way, and ends.
     """
@@ -620,8 +620,8 @@ def main(arguments: Sequence[str] | None) -> None:
     """The command."""
     parser = make_parser(
         "train",
-        "Trains HVNet, validates it as KITTI does, and writes checkpoint.pt, metrics.jsonl, tensorboard/ and pictures/ "
-        "to the run's folder. To train on 8 GPUs, put torchrun --nproc-per-node 8 in the place of python.",
+        "Trains HVNet, validates it as KITTI does, and writes checkpoint.pt, metrics.jsonl, tensorboard/, pictures/ "
+        "and data.txt (where the data are) to the run's folder. To train on 8 GPUs, put torchrun --nproc-per-node 8 in the place of python.",
         [
             "",
             "--config configs/compact.yaml --data /data/kitti --set train.batch_size=2",
