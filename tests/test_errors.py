@@ -125,9 +125,6 @@ def test_nothing_comes_from_elsewhere(run: Path) -> None:
     assert {tag for tag, _ in page.tags} & {"script", "link", "iframe", "object"} == set()
     assert "http" not in text
     assert "url(" not in text
-    assert [
-        (key, value[:5]) for _, each in page.tags for key, value in each.items() if key in ("src", "href") and value
-    ]
     for _, attributes in page.tags:
         assert (attributes.get("src") or "data:").startswith("data:")
         assert "href" not in attributes
