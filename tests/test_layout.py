@@ -55,6 +55,7 @@ ALLOWED = {f"kernels.{name}": allowed for name, allowed in KERNELS.items()} | {
     "train": NETWORK | DATA | {"model", "detector", "draw", "evaluate", "ranks"},
     "detect": NETWORK | DATA | {"model", "detector", "draw", "evaluate"},
     "study": ANY_KERNEL | NETWORK | DATA | {"model", "detector", "evaluate", "matching", "train"},
+    "view": NETWORK | DATA | {"kernels.voxel", "model", "detector", "draw", "mistakes", "detect"},
 }
 
 

@@ -1,0 +1,431 @@
+"""The viewer: what it computes, what its controls do, and the page in a headless browser."""
+
+import contextlib
+import itertools
+import json
+import math
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from hvnet.cli import InputError
+from hvnet.detect import Source, find_sources
+from hvnet.detector import Detector, load
+from hvnet.kernels.voxel import make_grid
+from hvnet.mistakes import FALSE_POSITIVE, MISS, Mistake
+from hvnet.model import Detections
+from hvnet.view import (
+    Viewer,
+    above,
+    box_lines,
+    brighter,
+    camera_for,
+    ground_height,
+    main,
+    mistake_line,
+    norm_image,
+    paragraph,
+    points_per_voxel,
+    read_scene,
+    shades,
+    start_server,
+)
+
+ROOT = Path(__file__).resolve().parents[1]
+SCORES = [0.9, 0.5, 0.1]
+
+
+# --- what is shown ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("score", "kept"), [(0.0, [0, 1, 2]), (0.1, [0, 1, 2]), (0.5, [0, 1]), (0.51, [0]), (1, [])])
+def test_detections_are_filtered_by_score(score: float, kept: list[int]) -> None:
+    found = Detections(torch.rand(3, 7), torch.tensor(SCORES, dtype=torch.float64), torch.tensor([2, 0, 1]))
+    for column, all_rows in zip(above(found, score), found, strict=True):
+        assert torch.equal(column, all_rows[kept])
+
+
+def test_shades_go_from_dark_to_bright_and_stop_there() -> None:
+    colours = shades(np.array([-9.0, 0, 1, 2, 9]), 0, 2)
+    assert colours.dtype == np.uint8
+    assert colours[[0, 1, 3, 4]].tolist() == [[68, 1, 84]] * 2 + [[253, 231, 36]] * 2  # viridis' ends
+    assert (np.diff(colours[1:4].astype(int).sum(axis=1)) > 0).all()
+    assert shades(np.zeros(0), 0, 1).shape == (0, 3)
+
+
+def test_colours_are_brighter_on_dark_ground() -> None:
+    assert [brighter(colour) for colour in ("#000000", "#ff0000", "#ffffff")] == ["#4c4c4c", "#ff4c4c", "#ffffff"]
+
+
+@pytest.mark.parametrize(("yaw", "front"), [(0, (12, 5)), (math.pi / 2, (10, 7)), (-math.pi, (8, 5))])
+def test_lines_of_a_box(yaw: float, front: tuple[float, float]) -> None:
+    """Twelve edges, and one line on the top from the middle to the front."""
+    lines = box_lines(torch.tensor([[10.0, 5, -1, 4, 2, 1.5, yaw]]))
+    assert lines.shape == (1, 13, 2, 3)
+    lengths = np.linalg.norm(lines[0, :, 0] - lines[0, :, 1], axis=1)
+    np.testing.assert_allclose(sorted(lengths), [1.5] * 4 + [2] * 5 + [4] * 4, rtol=1e-5)
+    np.testing.assert_allclose(lines[0, 12], [(10, 5, -0.25), (*front, -0.25)], atol=1e-5)
+    assert box_lines(torch.zeros(0, 7)).shape == (0, 13, 2, 3)
+
+
+def test_points_per_voxel() -> None:
+    grid = make_grid((0.0, -2.0, -3.0, 4.0, 2.0, 1.0), (0.5, 0.5), 1.0)
+    xyz = [(0.1, 0.1, 0), (0.4, 0.4, -2), (0.6, 0.1, 0), (0.2, 0.3, 0.5), (9, 0, 0), (0.1, 0.1, 1.5), (3.9, -1.9, 0)]
+    points = torch.cat((torch.tensor(xyz), torch.zeros(len(xyz), 1)), dim=1)
+    assert points_per_voxel(points, grid).tolist() == [3, 3, 1, 3, 0, 0, 1]
+    assert points_per_voxel(points[:0], grid).tolist() == []
+
+
+def test_norm_image_has_x_to_the_right_and_y_down() -> None:
+    image = torch.zeros(2, 3, 5, dtype=torch.bfloat16)
+    image[:, 1, 4] = torch.tensor([3.0, 4.0])
+    image[:, 2, 0] = torch.tensor([0.0, 1.0])
+    colours = norm_image(image)
+    assert colours.shape == (5, 3, 4)
+    assert np.argwhere(colours[..., 3]).tolist() == [[0, 2], [4, 1]]
+    assert colours[4, 1, :3].sum() > colours[0, 2, :3].sum()  # a larger norm is brighter
+    assert not norm_image(torch.zeros(2, 3, 5))[..., 3].any()
+
+
+def test_the_ground_is_below_nearly_all_points() -> None:
+    z = torch.cat((torch.linspace(-1.7, 1, 1000), torch.tensor([-50.0])))
+    points = torch.stack((torch.zeros_like(z), torch.zeros_like(z), z, torch.zeros_like(z)), dim=1)
+    assert -1.75 < ground_height(points) < -1.6
+    assert ground_height(points[:0]) == 0
+
+
+@pytest.mark.parametrize(
+    ("centre", "stand"),
+    [((30, 0, -1), (20, 0, 5)), ((0, 30, -1), (0, 20, 5)), ((-30, -40, 1), (-24, -32, 7)), ((0, 0, 0), (-10, 0, 6))],
+)
+def test_the_camera_comes_from_the_sensor(centre: tuple[float, ...], stand: tuple[float, ...]) -> None:
+    position, look_at = camera_for(torch.tensor([*centre, 4, 2, 1.5, 0.3], dtype=torch.float32))
+    np.testing.assert_allclose(position, stand, atol=1e-5)
+    np.testing.assert_allclose(look_at, centre)
+
+
+@pytest.mark.parametrize(
+    ("kind", "line"), [(MISS, "Car, 7 points, 12 m, 000003"), (FALSE_POSITIVE, "Car, score 0.82, 12 m, 000003")]
+)
+def test_a_mistake_in_words(kind: str, line: str) -> None:
+    assert mistake_line(Mistake("000003", kind, "Car", torch.zeros(7), 0.824, 12.3, 7, 0.4)) == line
+
+
+def test_text_is_no_html() -> None:
+    assert "a&lt;b&gt;.bin: bad<br>&amp;" in paragraph("a<b>.bin: bad", "&")
+
+
+def test_what_a_scene_holds(scenes: Path, tmp_path: Path) -> None:
+    root = tmp_path / "kitti"
+    shutil.copytree(scenes / "training", root / "training")
+    (root / "training" / "label_2" / "000001.txt").unlink()
+    images = root / "training" / "image_2"
+    images.mkdir()
+    Image.new("L", (30, 20)).save(images / "000000.png")
+    (images / "000002.png").write_text("no image")
+    first, second, third = (Source(f"{k:06d}", root, "training") for k in range(3))
+    scene = read_scene(first)
+    assert scene.frame is not None
+    assert scene.image is not None
+    assert scene.image.shape == (20, 30, 3)
+    assert read_scene(second)[1:] == (None, None, [])
+    with pytest.raises(InputError, match=r"000002\.png"):
+        read_scene(third)
+    cloud = root / "training" / "velodyne" / "000000.bin"
+    scene = read_scene(Source("a", cloud, None))
+    assert len(scene.points) * 16 == cloud.stat().st_size
+    assert scene[1:] == (None, None, [])
+
+
+# --- the command -----------------------------------------------------------------------------------------------------
+
+
+def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(InputError, match=r"pip install 'hvnet\[view\]' \(from a clone: pip install -e '\.\[view\]'\)$"):
+        main([])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nothing.bin"], "nothing.bin: no such file"),
+        (["{run}", "--checkpoint", "a.pt"], "--checkpoint: .*run.* is a run"),
+        (["{tmp}", "--data", "{tmp}"], "--data: goes with the folder of a run"),
+        (["--data", "{tmp}"], "--data: goes with the folder of a run"),
+        (["{tmp}"], "holds no cloud"),
+        (["{cloud}", "--split", "val"], "--split val: none of the inputs is a KITTI root"),
+        (["{cloud}", "--port", "70000"], "--port 70000: want 0 to 65535"),
+        (["{cloud}", "--host", "203.0.113.7"], "--host 203.0.113.7: .*try 127.0.0.1"),
+        (["{cut}"], "cut.bin: 15 bytes are no multiple of 16"),
+    ],
+)
+def test_a_users_mistake_is_said(arguments: list[str], message: str, tmp_path: Path) -> None:
+    pytest.importorskip("viser")
+    run, cut, cloud = tmp_path / "run", tmp_path / "cut.bin", tmp_path / "a" / "cloud.bin"
+    for folder in (run, cloud.parent, tmp_path / "empty"):
+        folder.mkdir()
+    (run / "checkpoint.pt").write_bytes(b"")
+    cut.write_bytes(bytes(15))
+    cloud.write_bytes(bytes(32))
+    names = {"run": run, "tmp": tmp_path / "empty", "cut": cut, "cloud": cloud}
+    with pytest.raises(InputError, match=message):
+        main(["--port", "0", *(argument.format(**names) for argument in arguments)])
+
+
+# --- the controls, without a browser ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def detector() -> Detector:
+    return load(device="cpu")
+
+
+@pytest.fixture
+def viewer(scenes: Path, detector: Detector) -> Iterator[Viewer]:
+    """The viewer of the six generated frames."""
+    pytest.importorskip("viser")
+    server = start_server("127.0.0.1", 0)
+    yield Viewer(server, detector, find_sources([scenes], None))
+    server.stop()
+
+
+def shown(text: str) -> tuple[int, int]:
+    """How many detections are shown, and of how many."""
+    match = re.search(r"(\d+) of (\d+) detections", text)
+    assert match, text
+    return int(match[1]), int(match[2])
+
+
+def test_the_slider_filters_boxes_and_names(viewer: Viewer) -> None:
+    scores = viewer.detections.scores
+    assert len(scores) > 3
+    for score in (0.1, 0.3, float(scores.median()), 0.7, 1.0):
+        viewer.score.value = score
+        kept = int((scores >= viewer.score.value).sum())
+        assert shown(viewer.info.content) == (kept, len(scores))
+        names = [text for text, _ in viewer.texts if text.visible]
+        assert len(names) == kept + len(viewer.scene.frame.boxes)  # type: ignore[union-attr]
+    viewer.named.value = False
+    assert not any(text.visible for text, _ in viewer.texts)
+
+
+def test_frames_follow_each_other_round(viewer: Viewer) -> None:
+    names = [f"{k:06d}" for k in range(6)]
+    seen = []
+    for _ in range(7):
+        assert viewer.scene.frame is not None
+        assert viewer.scene.frame.id == viewer.chooser.value
+        seen.append(viewer.chooser.value)
+        viewer.go(viewer.wanted + 1)
+    assert seen == [*names, names[0]]
+    viewer.go(-1)
+    assert viewer.chooser.value == names[-1]
+
+
+def test_all_colours_and_pseudo_images_can_be_drawn(viewer: Viewer) -> None:
+    scene = viewer.server.scene
+    for colour in viewer.colour.options:
+        viewer.colour.value = colour
+        node: Any = scene.get_handle_by_name("/points")
+        assert node.colors.shape == viewer.scene.points[:, :3].shape
+        assert len(np.unique(node.colors, axis=0)) > 5
+    assert scene.get_handle_by_name("/pseudo-image") is None
+    sizes = []
+    for scale in viewer.overlay.options[1:]:
+        viewer.overlay.value = scale
+        node = scene.get_handle_by_name("/pseudo-image")
+        sizes.append((node.render_width, node.render_height, *node.position[:2]))
+    assert sizes == [(64, 64, 32, 0)] * 3  # metres: the range of the shipped weights
+    viewer.overlay.value = "off"
+    assert scene.get_handle_by_name("/pseudo-image") is None
+
+
+def test_the_worst_mistakes_are_listed_and_shown(viewer: Viewer) -> None:
+    viewer.search()
+    assert "6 of 6 frames searched, 6 have labels" in viewer.progress.content
+    for column, mistakes in zip(viewer.buttons, viewer.listed, strict=True):
+        assert mistakes
+        lines = [button.label for button in column if button.visible]
+        assert lines == [mistake_line(mistake) for mistake in mistakes]
+    misses, false_positives = viewer.listed
+    assert all(a.points >= b.points for a, b in itertools.pairwise(misses))
+    assert all(a.score >= b.score for a, b in itertools.pairwise(false_positives))
+    for mistake in (misses[0], false_positives[-1]):
+        client: Any = SimpleNamespace(camera=SimpleNamespace(), atomic=contextlib.nullcontext)
+        viewer.jump(mistake, client)
+        np.testing.assert_allclose(client.camera.look_at, mistake.box[:3], rtol=1e-6)
+        assert viewer.chooser.value == mistake.frame
+        node: Any = viewer.server.scene.get_handle_by_name("/chosen")
+        np.testing.assert_allclose(node.points.mean(axis=(0, 1))[:2], mistake.box[:2], atol=0.2)
+    viewer.go(viewer.wanted + 1)
+    assert viewer.server.scene.get_handle_by_name("/chosen") is None
+
+
+def test_a_frame_that_cannot_be_read_is_named_and_left_again(scenes: Path, detector: Detector, tmp_path: Path) -> None:
+    pytest.importorskip("viser")
+    clouds = tmp_path / "clouds"
+    shutil.copytree(scenes / "training" / "velodyne", clouds)
+    (clouds / "000001.bin").write_bytes(bytes(15))
+    server = start_server("127.0.0.1", 0)
+    try:
+        viewer = Viewer(server, detector, find_sources([clouds], None))
+        viewer.search()
+        assert "6 of 6 frames searched, 0 have labels<br>1 cannot be read" in viewer.progress.content
+        assert viewer.listed == ([], [])
+        viewer.go(1)
+        assert "000001.bin: 15 bytes" in viewer.info.content
+        assert shown(viewer.info.content) == (0, 0)
+        viewer.go(2)
+        assert shown(viewer.info.content)[1] > 0
+    finally:
+        server.stop()
+
+
+# --- the page --------------------------------------------------------------------------------------------------------
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",  # which root has none of
+    "--use-angle=swiftshader",  # WebGL without a GPU
+    "--enable-unsafe-swiftshader",
+    "--remote-debugging-port=0",
+    "--no-first-run",
+    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",  # the page has to do without the internet
+)
+KEYS = {"n": ("KeyN", 78, "n"), "p": ("KeyP", 80, "p"), "ArrowRight": ("ArrowRight", 39, "")}
+
+
+class Browser:
+    """Chromium without a screen, by its DevTools protocol."""
+
+    def __init__(self, folder: Path) -> None:
+        from websockets.sync.client import connect
+
+        assert CHROMIUM
+        command = [CHROMIUM, *FLAGS, f"--user-data-dir={folder}", "--window-size=800,600", "about:blank"]
+        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        address = folder / "DevToolsActivePort"
+        wait(lambda: address.is_file() and len(address.read_text().splitlines()) == 2)
+        port = address.read_text().splitlines()[0]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json") as answer:
+            page = next(each for each in json.load(answer) if each["type"] == "page")
+        self.socket = connect(page["webSocketDebuggerUrl"], max_size=None)
+        self.calls = itertools.count()
+        self.errors: list[Any] = []  # what is logged as an error; warnings, such as of slow rendering, are none
+        self.addresses: list[str] = []
+        for domain in ("Runtime", "Log", "Network", "Page"):
+            self.call(f"{domain}.enable")
+
+    def call(self, method: str, **parameters: object) -> dict[str, Any]:
+        number = next(self.calls)
+        self.socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
+        while True:
+            message = json.loads(self.socket.recv(timeout=60))
+            if message.get("id") == number:
+                assert "error" not in message, message
+                return message["result"]
+            event, about = message.get("method"), message.get("params", {})
+            if event == "Network.requestWillBeSent":
+                self.addresses.append(about["request"]["url"])
+            elif (
+                event == "Runtime.exceptionThrown"
+                or (event == "Log.entryAdded" and about["entry"]["level"] == "error")
+                or (event == "Runtime.consoleAPICalled" and about["type"] in ("error", "assert"))
+            ):
+                self.errors.append(about)
+
+    def run(self, script: str) -> Any:
+        return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
+
+    def text(self) -> str:
+        return self.run("document.body?.innerText ?? ''")  # there is no body before the page comes
+
+    def frame(self) -> str:
+        """The value of the first field that holds one: the frame chooser."""
+        return self.run("[...document.querySelectorAll('input')].map(e => e.value).find(v => /^0\\d{5}$/.test(v))")
+
+    def press(self, key: str) -> None:
+        code, number, text = KEYS[key]
+        parts = {"key": key, "code": code, "windowsVirtualKeyCode": number}
+        self.call("Input.dispatchKeyEvent", type="keyDown", text=text, **parts)
+        self.call("Input.dispatchKeyEvent", type="keyUp", **parts)
+
+    def close(self) -> None:
+        self.call("Browser.close")
+        self.process.wait(30)
+
+
+def wait(condition: Any, seconds: float = 60) -> None:
+    """Until a condition holds."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.1)
+
+
+def test_the_page_in_a_browser(scenes: Path, tmp_path: Path) -> None:
+    """The command, its page in Chromium: slider, keys, buttons; nothing goes wrong, nothing is fetched elsewhere."""
+    pytest.importorskip("viser")
+    if CHROMIUM is None:
+        pytest.skip("no Chromium")
+    command = [sys.executable, "-m", "hvnet.view", str(scenes), "--port", "0", "--device", "cpu"]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout
+        line = process.stdout.readline()
+        address = line.split()[0]
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+", address)
+        browser = Browser(tmp_path / "profile")
+        try:
+            browser.call("Page.navigate", url=address)
+            wait(lambda: "frames searched" in browser.text() and browser.run("!!document.querySelector('canvas')"))
+            assert browser.frame() == "000000"
+            before, total = shown(browser.text())
+            assert 0 < before < total
+
+            browser.run("document.querySelector('[role=slider]').focus()")
+            for _ in range(30):
+                browser.press("ArrowRight")
+            wait(lambda: shown(browser.text())[0] < before)
+            assert shown(browser.text())[1] == total
+
+            browser.press("n")
+            wait(lambda: browser.frame() == "000001")
+            browser.press("n")
+            wait(lambda: browser.frame() == "000002")
+            browser.press("p")
+            wait(lambda: browser.frame() == "000001")
+            browser.run("[...document.querySelectorAll('button')].find(e => e.innerText == 'previous (p)').click()")
+            wait(lambda: browser.frame() == "000000")
+
+            wait(lambda: "6 of 6 frames searched" in browser.text())
+            buttons = "[...document.querySelectorAll('button')].filter(e => / points, .* m, 0/.test(e.innerText))"
+            wanted = browser.run(f"{buttons}[0].innerText").split(", ")[-1]
+            browser.run(f"{buttons}[0].click()")
+            wait(lambda: browser.frame() == wanted)
+            assert browser.errors == []
+            assert {each.split(":")[0] for each in browser.addresses} <= {"http", "blob", "data"}
+            assert all(each.startswith(address) for each in browser.addresses if each.startswith("http:"))
+        finally:
+            browser.close()
+        process.send_signal(signal.SIGINT)
+        rest, errors = process.communicate(timeout=30)
+        assert (process.returncode, rest, errors) == (130, "", "interrupted\n")
+    finally:
+        process.kill()
+        process.communicate()
