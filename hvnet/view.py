@@ -176,7 +176,8 @@ class Viewer:
         self.scene, self.detections = Scene(torch.zeros(0, 4), None, None, []), NOTHING  # the frame that is shown
         self.texts: list[tuple[viser.LabelHandle, float]] = []  # of every box of this frame, and its score
         self.found: dict[int, Detections] = {}  # of every frame that was examined
-        self.mistakes: dict[int, list[Mistake]] = {}  # of those with labels
+        self.labelled = [k for k, source in enumerate(sources) if source.kitti_file("label_2", ".txt") is not None]
+        self.mistakes: dict[int, list[Mistake]] = {}  # of every labelled frame that was examined
         self.listed: tuple[list[Mistake], list[Mistake]] = [], []
 
         encoder = detector.encoder.encoder
@@ -197,12 +198,12 @@ class Viewer:
         self.named = gui.add_checkbox("names", True)
         gui.add_html(legend({"labelled": brighter(TRUTH_COLOUR)} | self.colours))
         self.info = gui.add_html("")
-        with gui.add_folder("worst misses"):
+        with gui.add_folder("worst misses", visible=len(self.labelled) > 0):
             misses = [gui.add_button("", visible=False) for _ in range(LISTED)]
-        with gui.add_folder("worst false positives"):
+        with gui.add_folder("worst false positives", visible=len(self.labelled) > 0):
             false_positives = [gui.add_button("", visible=False) for _ in range(LISTED)]
         self.buttons = misses, false_positives
-        self.progress = gui.add_html("")
+        self.progress = gui.add_html("" if self.labelled else paragraph("no labels, so that no mistakes are known"))
         self.camera = gui.add_panel(visible=False)
         with self.camera.add_tab("camera"):
             self.picture = gui.add_image(np.zeros((1, 1, 3), np.uint8))
@@ -233,30 +234,26 @@ class Viewer:
             return scene, self.found[index]
 
     def search(self) -> None:
-        """Examines all frames, one after the other, while the page is in use, and lists the worst mistakes."""
+        """Examines the frames with labels, one after the other, while the page is in use; lists the worst mistakes."""
         unread = 0
-        for index in range(len(self.sources)):
+        for count, index in enumerate(self.labelled, 1):
             if index not in self.found:
                 try:
                     self.examine(index)
                 except (InputError, OSError):  # the page says what is wrong where the frame is chosen
                     unread += 1
                 time.sleep(0.01)  # lets a callback that waits have the lock
-            self.list_mistakes(index + 1, unread)
+            searched = f"{count} of {len(self.labelled)} labelled frames searched at score {SHOWN_SCORE}"
+            self.list_mistakes(searched, *([f"{unread} cannot be read"] if unread else []))
 
-    def list_mistakes(self, searched: int, unread: int) -> None:
-        """Writes the worst of the mistakes known so far on the buttons."""
+    def list_mistakes(self, *notes: str) -> None:
+        """Writes the worst of the mistakes known so far on the buttons, and some notes below."""
         with self.lock, self.server.atomic():
             self.listed = worst((mistake for part in self.mistakes.values() for mistake in part), LISTED)
             for column, mistakes in zip(self.buttons, self.listed, strict=True):
                 for button, mistake in zip(column, mistakes, strict=False):
                     button.label, button.visible = mistake_line(mistake), True
-            lines = [f"{searched} of {len(self.sources)} frames searched, {len(self.mistakes)} have labels"]
-            if self.mistakes:
-                lines.append(f"mistakes at score {SHOWN_SCORE}")
-            if unread:
-                lines.append(f"{unread} cannot be read")
-            self.progress.content = paragraph(*lines)
+            self.progress.content = paragraph(*notes)
 
     def go(self, index: int) -> None:
         """Shows a frame; the last one, if they are asked for faster than they come."""
@@ -399,6 +396,20 @@ def start_server(host: str, port: int) -> "viser.ViserServer":
     return viser.ViserServer(host, port, label="HVNet", verbose=False)
 
 
+def choose_data(given: Path | None, root: Path | None, checkpoint: Path | None) -> tuple[Path | None, Path | None]:
+    """The clouds, None for generated scenes, and the checkpoint, None for the package's, of the input that was given.
+
+    Raises InputError for options that do not go together.
+    """
+    if given is not None and (given / "checkpoint.pt").is_file():
+        if checkpoint is not None:
+            raise InputError(f"--checkpoint: the run {given} has its own; leave one of them out")
+        return root, given / "checkpoint.pt"
+    if root is not None:
+        raise InputError("--data: goes with the folder of a run, which holds checkpoint.pt; give the root as INPUT")
+    return given, checkpoint
+
+
 def main(arguments: Sequence[str] | None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(
@@ -410,7 +421,7 @@ def main(arguments: Sequence[str] | None) -> None:
         "  python -m hvnet.view clouds/ --checkpoint runs/demo/checkpoint.pt\n"
         "  python -m hvnet.view /data/kitti --split val\n"
         "  python -m hvnet.view runs/compact --data /data/kitti --split val\n"
-        "On another machine: ssh -L 8080:localhost:8080 MACHINE, then python -m hvnet.view there.",
+        "for clouds on another machine:\n  ssh -L 8080:localhost:8080 MACHINE, then python -m hvnet.view there",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
@@ -424,7 +435,7 @@ def main(arguments: Sequence[str] | None) -> None:
         "--checkpoint", type=Path, metavar="FILE", help="of python -m hvnet.train (default: the weights of the package)"
     )
     parser.add_argument("--data", type=Path, metavar="DIR", help="for a run: a KITTI root (default: generated scenes)")
-    parser.add_argument("--split", help="frames of ImageSets/SPLIT.txt of a KITTI root (default: all frames)")
+    parser.add_argument("--split", metavar="NAME", help="frames of ImageSets/NAME.txt of a KITTI root (default: all)")
     parser.add_argument("--port", type=int, default=8080, help="or the next that is free (default: 8080)")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: 127.0.0.1)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
@@ -432,13 +443,7 @@ def main(arguments: Sequence[str] | None) -> None:
 
     if importlib.util.find_spec("viser") is None:
         raise InputError("the viewer needs viser: pip install 'hvnet[view]' (from a clone: pip install -e '.[view]')")
-    data, checkpoint = options.input, options.checkpoint
-    if data is not None and (data / "checkpoint.pt").is_file():
-        if checkpoint is not None:
-            raise InputError(f"--checkpoint: {data} is a run and has its own; give --data DIR and no run")
-        data, checkpoint = options.data, data / "checkpoint.pt"
-    elif options.data is not None:
-        raise InputError("--data: goes with the folder of a run, which holds checkpoint.pt; give the root as INPUT")
+    data, checkpoint = choose_data(options.input, options.data, options.checkpoint)
     with tempfile.TemporaryDirectory() as folder:
         detector = load(checkpoint, options.device)
         if data is None:

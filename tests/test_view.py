@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -33,6 +33,7 @@ from hvnet.view import (
     box_lines,
     brighter,
     camera_for,
+    choose_data,
     ground_height,
     main,
     mistake_line,
@@ -163,10 +164,11 @@ def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.Mon
     ("arguments", "message"),
     [
         (["nothing.bin"], "nothing.bin: no such file"),
-        (["{run}", "--checkpoint", "a.pt"], "--checkpoint: .*run.* is a run"),
-        (["{tmp}", "--data", "{tmp}"], "--data: goes with the folder of a run"),
-        (["--data", "{tmp}"], "--data: goes with the folder of a run"),
-        (["{tmp}"], "holds no cloud"),
+        (["{run}", "--checkpoint", "a.pt"], "--checkpoint: the run .*run has its own"),
+        (["{run}", "--data", "{empty}"], "checkpoint.pt: truncated"),
+        (["{empty}", "--data", "{empty}"], "--data: goes with the folder of a run"),
+        (["--data", "{empty}"], "--data: goes with the folder of a run"),
+        (["{empty}"], "holds no cloud"),
         (["{cloud}", "--split", "val"], "--split val: none of the inputs is a KITTI root"),
         (["{cloud}", "--port", "70000"], "--port 70000: want 0 to 65535"),
         (["{cloud}", "--host", "203.0.113.7"], "--host 203.0.113.7: .*try 127.0.0.1"),
@@ -181,9 +183,24 @@ def test_a_users_mistake_is_said(arguments: list[str], message: str, tmp_path: P
     (run / "checkpoint.pt").write_bytes(b"")
     cut.write_bytes(bytes(15))
     cloud.write_bytes(bytes(32))
-    names = {"run": run, "tmp": tmp_path / "empty", "cut": cut, "cloud": cloud}
+    names = {"run": run, "empty": tmp_path / "empty", "cut": cut, "cloud": cloud}
     with pytest.raises(InputError, match=message):
         main(["--port", "0", *(argument.format(**names) for argument in arguments)])
+
+
+def test_a_run_brings_its_checkpoint(tmp_path: Path) -> None:
+    run, root, cloud, weights = (tmp_path / name for name in ("run", "root", "cloud.bin", "a.pt"))
+    run.mkdir()
+    (run / "checkpoint.pt").touch()
+    for given, wanted in {
+        (None, None, None): (None, None),
+        (None, None, weights): (None, weights),
+        (root, None, None): (root, None),
+        (cloud, None, weights): (cloud, weights),
+        (run, None, None): (None, run / "checkpoint.pt"),
+        (run, root, None): (root, run / "checkpoint.pt"),
+    }.items():
+        assert choose_data(*given) == wanted
 
 
 # --- the controls, without a browser ---------------------------------------------------------------------------------
@@ -195,12 +212,24 @@ def detector() -> Detector:
 
 
 @pytest.fixture
-def viewer(scenes: Path, detector: Detector) -> Iterator[Viewer]:
-    """The viewer of the six generated frames."""
+def serve(detector: Detector) -> Iterator[Callable[[Path], Viewer]]:
+    """Makes viewers of inputs."""
     pytest.importorskip("viser")
-    server = start_server("127.0.0.1", 0)
-    yield Viewer(server, detector, find_sources([scenes], None))
-    server.stop()
+    servers = []
+
+    def start(path: Path) -> Viewer:
+        servers.append(start_server("127.0.0.1", 0))
+        return Viewer(servers[-1], detector, find_sources([path], None))
+
+    yield start
+    for server in servers:
+        server.stop()
+
+
+@pytest.fixture
+def viewer(serve: Callable[[Path], Viewer], scenes: Path) -> Viewer:
+    """The viewer of the six generated frames."""
+    return serve(scenes)
 
 
 def shown(text: str) -> tuple[int, int]:
@@ -256,7 +285,7 @@ def test_all_colours_and_pseudo_images_can_be_drawn(viewer: Viewer) -> None:
 
 def test_the_worst_mistakes_are_listed_and_shown(viewer: Viewer) -> None:
     viewer.search()
-    assert "6 of 6 frames searched, 6 have labels" in viewer.progress.content
+    assert "6 of 6 labelled frames searched at score 0.5" in viewer.progress.content
     for column, mistakes in zip(viewer.buttons, viewer.listed, strict=True):
         assert mistakes
         lines = [button.label for button in column if button.visible]
@@ -275,24 +304,29 @@ def test_the_worst_mistakes_are_listed_and_shown(viewer: Viewer) -> None:
     assert viewer.server.scene.get_handle_by_name("/chosen") is None
 
 
-def test_a_frame_that_cannot_be_read_is_named_and_left_again(scenes: Path, detector: Detector, tmp_path: Path) -> None:
-    pytest.importorskip("viser")
-    clouds = tmp_path / "clouds"
-    shutil.copytree(scenes / "training" / "velodyne", clouds)
-    (clouds / "000001.bin").write_bytes(bytes(15))
-    server = start_server("127.0.0.1", 0)
-    try:
-        viewer = Viewer(server, detector, find_sources([clouds], None))
-        viewer.search()
-        assert "6 of 6 frames searched, 0 have labels<br>1 cannot be read" in viewer.progress.content
-        assert viewer.listed == ([], [])
-        viewer.go(1)
-        assert "000001.bin: 15 bytes" in viewer.info.content
-        assert shown(viewer.info.content) == (0, 0)
-        viewer.go(2)
-        assert shown(viewer.info.content)[1] > 0
-    finally:
-        server.stop()
+def test_a_frame_that_cannot_be_read_is_named_and_left_again(
+    serve: Callable[[Path], Viewer], scenes: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(scenes, tmp_path / "kitti")
+    (tmp_path / "kitti" / "training" / "velodyne" / "000001.bin").write_bytes(bytes(15))
+    viewer = serve(tmp_path / "kitti")
+    viewer.search()
+    assert "6 of 6 labelled frames searched at score 0.5<br>1 cannot be read" in viewer.progress.content
+    viewer.go(1)
+    assert "000001.bin: 15 bytes" in viewer.info.content
+    assert shown(viewer.info.content) == (0, 0)
+    viewer.go(2)
+    assert shown(viewer.info.content)[1] > 0
+
+
+def test_clouds_without_labels_have_no_mistakes(serve: Callable[[Path], Viewer], scenes: Path) -> None:
+    viewer = serve(scenes / "training" / "velodyne")
+    viewer.search()
+    assert list(viewer.found) == [0]  # where nothing can be missed, nothing is searched
+    assert "no mistakes are known" in viewer.progress.content
+    assert viewer.listed == ([], [])
+    assert shown(viewer.info.content)[1] > 0
+    assert "labelled" not in viewer.info.content
 
 
 # --- the page --------------------------------------------------------------------------------------------------------
@@ -378,12 +412,12 @@ def wait(condition: Any, seconds: float = 60) -> None:
         time.sleep(0.1)
 
 
-def test_the_page_in_a_browser(scenes: Path, tmp_path: Path) -> None:
-    """The command, its page in Chromium: slider, keys, buttons; nothing goes wrong, nothing is fetched elsewhere."""
+def test_the_page_in_a_browser(tmp_path: Path) -> None:
+    """The command on generated scenes: slider, keys and buttons work, no error is logged, nothing comes from afar."""
     pytest.importorskip("viser")
     if CHROMIUM is None:
         pytest.skip("no Chromium")
-    command = [sys.executable, "-m", "hvnet.view", str(scenes), "--port", "0", "--device", "cpu"]
+    command = [sys.executable, "-m", "hvnet.view", "--port", "0", "--device", "cpu"]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stdout
@@ -393,7 +427,7 @@ def test_the_page_in_a_browser(scenes: Path, tmp_path: Path) -> None:
         browser = Browser(tmp_path / "profile")
         try:
             browser.call("Page.navigate", url=address)
-            wait(lambda: "frames searched" in browser.text() and browser.run("!!document.querySelector('canvas')"))
+            wait(lambda: "labelled frames" in browser.text() and browser.run("!!document.querySelector('canvas')"))
             assert browser.frame() == "000000"
             before, total = shown(browser.text())
             assert 0 < before < total
@@ -413,7 +447,7 @@ def test_the_page_in_a_browser(scenes: Path, tmp_path: Path) -> None:
             browser.run("[...document.querySelectorAll('button')].find(e => e.innerText == 'previous (p)').click()")
             wait(lambda: browser.frame() == "000000")
 
-            wait(lambda: "6 of 6 frames searched" in browser.text())
+            wait(lambda: "4 of 4 labelled frames searched" in browser.text())
             buttons = "[...document.querySelectorAll('button')].filter(e => / points, .* m, 0/.test(e.innerText))"
             wanted = browser.run(f"{buttons}[0].innerText").split(", ")[-1]
             browser.run(f"{buttons}[0].click()")
