@@ -64,4 +64,4 @@ def scores_of(logits: Tensor, iou: Tensor | None) -> Tensor:
 
 def anchor_rows(output: Tensor, values: int) -> Tensor:
     """A map (B, N_anc * values, N_L, N_W) as (B, N_L * N_W * N_anc, values) float32, the order of the anchors."""
-    return output.permute(0, 2, 3, 1).reshape(len(output), -1, values).to(torch.float32)
+    return output.permute(0, 2, 3, 1).reshape(output.shape[0], -1, values).to(torch.float32)

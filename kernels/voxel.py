@@ -259,7 +259,7 @@ def _hashed_voxels(cursor: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 def _check_points(points: Tensor, sample: Tensor) -> None:
     check_tensor("points", points, (torch.float32,), (None, 4))
-    check_tensor("sample", sample, (torch.int64,), (len(points),), like=points)
+    check_tensor("sample", sample, (torch.int64,), (points.shape[0],), like=points)
 
 
 @wp.func
