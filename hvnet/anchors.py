@@ -31,11 +31,15 @@ def anchors_per_cell(entry: ClassConfig) -> int:
     return len(ORIENTATIONS) * len(entry.anchor_sizes)
 
 
+def level_step(config: Config, entry: ClassConfig) -> int:
+    """Cells of the finest pseudo-image along one cell of a class's map."""
+    # the levels start at the third last block
+    return config.backbone.stride * 2 ** (pyramid_depth(config.encoder) - 3 + entry.level)
+
+
 def make_anchors(config: Config, entry: ClassConfig) -> Tensor:
     """Anchors (A, 7) of a class at the centres of its level's cells, in the order (x, y, size, orientation)."""
-    grid = projection_grids(config.encoder)[0]
-    # the levels start at the third last block
-    step = config.backbone.stride * 2 ** (pyramid_depth(config.encoder) - 3 + entry.level)
+    grid, step = projection_grids(config.encoder)[0], level_step(config, entry)
     cell = (grid.cell[0] * step, grid.cell[1] * step)
     x = grid.x_min + (torch.arange(grid.shape[0] // step, dtype=torch.float64) + 0.5) * cell[0]
     y = grid.y_min + (torch.arange(grid.shape[1] // step, dtype=torch.float64) + 0.5) * cell[1]

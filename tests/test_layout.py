@@ -54,6 +54,7 @@ ALLOWED = {f"kernels.{name}": allowed for name, allowed in KERNELS.items()} | {
     "weights.__main__": {"data.database", "model", "train"},
     "train": NETWORK | DATA | {"model", "detector", "draw", "evaluate", "ranks"},
     "detect": NETWORK | DATA | {"model", "detector", "draw", "evaluate"},
+    "export": {"config", "anchors", "encoder", "head", "model", "detector"},
     "study": ANY_KERNEL | NETWORK | DATA | {"model", "detector", "evaluate", "matching", "train"},
     "view": NETWORK | DATA | {"kernels.voxel", "model", "detector", "draw", "mistakes", "detect"},
 }

@@ -1,0 +1,299 @@
+"""Export: the ONNX file and the program of torch.export against torch, and docs/deploy.md as it stands."""
+
+import dataclasses
+import importlib.util
+import json
+import re
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from hvnet.anchors import make_anchors
+from hvnet.cli import InputError
+from hvnet.config import config_to_dict, load_config
+from hvnet.data.kitti import read_frame
+from hvnet.detector import SHIPPED
+from hvnet.export import describe, main, map_names, maps_of_class, write_onnx, write_program
+from hvnet.head import HeadMaps
+from hvnet.model import Detections, HVNet, load_checkpoint, model_from_checkpoint, save_checkpoint
+
+ROOT = Path(__file__).resolve().parents[1]
+DEMO = ROOT / "configs" / "demo.yaml"
+NARROW = "encoder.point_range=[0, -3.2, -3, 12.8, 3.2, 2]"  # not square: 32 x 16 cells at the finest scale
+
+
+def lively(*changes: str) -> HVNet:
+    """A small model whose maps differ from anchor to anchor, and whose batch norms do something."""
+    torch.manual_seed(0)
+    config = load_config(DEMO, [NARROW, *changes])
+    model = HVNet(dataclasses.replace(config, head=dataclasses.replace(config.head, score_threshold=0.02)))
+    for head in model.heads:
+        for branch in (head.score, head.location, head.vertical):
+            torch.nn.init.normal_(branch.weight, std=0.05)
+    for module in model.modules():
+        if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
+            torch.nn.init.uniform_(module.weight, 0.5, 1.5)
+            torch.nn.init.uniform_(module.bias, -0.5, 0.5)
+            module.momentum = 1.0
+    with torch.no_grad():
+        model(*clouds(model, 2), 2)
+    return model.eval()
+
+
+def clouds(model: HVNet, count: int, points: int = 500) -> tuple[Tensor, Tensor]:
+    """Random points of as many clouds in the model's range, and the clouds they belong to."""
+    low, high = torch.tensor(model.config.encoder.point_range).view(2, 3)
+    generator = torch.Generator().manual_seed(count)
+    where = low + torch.rand(count * points, 3, generator=generator) * (high - low)
+    reflectance = torch.rand(count * points, 1, generator=generator)
+    return torch.cat((where, reflectance), dim=1), torch.arange(count).repeat_interleave(points)
+
+
+def scene(root: Path, count: int) -> tuple[Tensor, Tensor]:
+    """The points of the first frames of a KITTI root, and the clouds they belong to."""
+    parts = [read_frame(root, f"{k:06d}").points for k in range(count)]
+    return torch.cat(parts), torch.repeat_interleave(torch.tensor([len(part) for part in parts]))
+
+
+@pytest.fixture(scope="module")
+def shipped() -> HVNet:
+    return model_from_checkpoint(load_checkpoint(SHIPPED), str(SHIPPED))
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with what the command makes of the shipped weights."""
+    pytest.importorskip("onnx", reason="onnx is not installed: pip install '.[test]'")
+    out = tmp_path_factory.mktemp("deploy") / "export"
+    main(["--out", str(out)])
+    return out
+
+
+def maps_of_onnx(path: Path, images: list[Tensor]) -> dict[str, Tensor]:
+    """What onnxruntime makes of pseudo-images."""
+    onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed: pip install '.[test]'")
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    names = [output.name for output in session.get_outputs()]
+    inputs = {given.name: images[int(given.name[-1])].contiguous().numpy() for given in session.get_inputs()}
+    values = session.run(names, inputs)
+    return {name: torch.from_numpy(value) for name, value in zip(names, values, strict=True)}
+
+
+def by_name(model: HVNet, maps: list[HeadMaps]) -> dict[str, Tensor]:
+    """The maps of a model under the names that they are exported with."""
+    values = [value for of_class in maps for value in of_class if value is not None]
+    return dict(zip(map_names(model.config), values, strict=True))
+
+
+def assert_same_maps(found: dict[str, Tensor], want: dict[str, Tensor]) -> None:
+    """Within a ten-thousandth of each map's range."""
+    assert found.keys() == want.keys()
+    for name, value in want.items():
+        assert found[name].shape == value.shape
+        assert found[name].dtype == torch.float32
+        span = float(value.max() - value.min())
+        assert span > 0, name
+        assert float((found[name] - value).abs().max()) < 1e-4 * span, name
+
+
+def assert_same_boxes(found: Detections, want: Detections) -> None:
+    assert torch.equal(found.labels, want.labels)
+    torch.testing.assert_close(found.scores, want.scores, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(found.boxes[:, :6], want.boxes[:, :6], rtol=1e-3, atol=1e-3)
+    assert (torch.cos(found.boxes[:, 6] - want.boxes[:, 6]) > 1 - 1e-5).all()
+
+
+def boxes_of_maps(model: HVNet, maps: dict[str, Tensor], monkeypatch: pytest.MonkeyPatch, batch: int) -> Any:
+    """What the model's own decoding and NMS make of maps from elsewhere."""
+    config = model.config
+    of_classes = [
+        HeadMaps(**{"direction": None} | {field: maps[name] for field, name in maps_of_class(config, entry).items()})
+        for entry in config.head.classes
+    ]
+    with monkeypatch.context() as patch:
+        patch.setattr(model, "forward", lambda *_: of_classes)
+        return model.detect(torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), batch)
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+@pytest.mark.parametrize("name", ["compact", "demo"])
+def test_onnx_gives_the_maps_and_boxes_of_torch(
+    name: str, batch: int, shipped: HVNet, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The shipped weights on generated scenes, the demo's network on noise; one file serves any batch."""
+    pytest.importorskip("onnx", reason="onnx is not installed: pip install '.[test]'")
+    model = shipped if name == "compact" else lively()
+    points, sample = scene(scenes, batch) if name == "compact" else clouds(model, batch)
+    write_onnx(model, tmp_path / "part.onnx")
+    with torch.no_grad():
+        images = model.encoder(points, sample, batch)
+        want = by_name(model, model.maps_of(images))
+    found = maps_of_onnx(tmp_path / "part.onnx", images)
+    assert_same_maps(found, want)
+    plain = model.detect(points, sample, batch)
+    assert len(plain) == batch
+    assert all(len(each.boxes) > 2 for each in plain)
+    for one, other in zip(boxes_of_maps(model, found, monkeypatch, batch), plain, strict=True):
+        assert_same_boxes(one, other)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        ("head.regression=pose", "head.iou=true", "head.direction=false"),
+        ("backbone.pyramid=fpn", "encoder.projection_scales=[1, 2, 4, 8]"),
+        ("backbone.pyramid=none", "encoder.point_limit=1"),  # no class at the coarsest level: no input image_2
+        ("backbone.pyramid=upsampled", "head.classes.Car.level=0"),
+    ],
+    ids=str,
+)
+def test_onnx_of_every_switch(changes: tuple[str, ...], tmp_path: Path) -> None:
+    pytest.importorskip("onnx", reason="onnx is not installed: pip install '.[test]'")
+    model = lively(*changes)
+    write_onnx(model, tmp_path / "part.onnx")
+    with torch.no_grad():
+        images = model.encoder(*clouds(model, 2), 2)
+        want = by_name(model, model.maps_of(images))
+    assert_same_maps(maps_of_onnx(tmp_path / "part.onnx", images), want)
+
+
+def test_the_onnx_file_is_standard_and_folded(exported: Path, shipped: HVNet) -> None:
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load(exported / "backbone_heads.onnx")
+    onnx.checker.check_model(model, full_check=True)
+    assert {node.domain for node in model.graph.node} == {""}
+    kinds = [node.op_type for node in model.graph.node]
+    assert "BatchNormalization" not in kinds
+    # blocks, the FFPN without the level that no class has, four branches of three heads
+    assert kinds.count("Conv") == (3 + 5 + 5) + (3 + 2) + 4 * 3
+    meta = json.loads((exported / "meta.json").read_text())
+    for image, given in zip(meta["images"], model.graph.input, strict=True):
+        batch, *shape = given.type.tensor_type.shape.dim
+        assert given.name == image["name"]
+        assert batch.dim_param == "batch"
+        assert [axis.dim_value for axis in shape] == [image["channels"], *image["cells"]]
+    names = [name for entry in meta["classes"] for name in entry["outputs"].values()]
+    assert names == [output.name for output in model.graph.output] == map_names(shipped.config)
+
+
+def test_the_program_in_a_fresh_process(exported: Path, shipped: HVNet, scenes: Path, tmp_path: Path) -> None:
+    """Clouds of other lengths than the one that it was traced with."""
+    whole = scene(scenes, 1)[0]
+    given = [whole, whole[::7].clone(), whole[whole[:, 0] > 3][:2].clone()]
+    assert len(given[2]) == 2
+    torch.save(given, tmp_path / "clouds.pt")
+    code = (
+        "import sys, torch, hvnet.encoder\n"
+        "program, clouds, maps = sys.argv[1:]\n"
+        "run = torch.export.load(program).module()\n"
+        "given = torch.load(clouds)\n"
+        "torch.save([run(each, torch.zeros(len(each), dtype=torch.int64)) for each in given], maps)\n"
+    )
+    files = [exported / "detector.pt2", tmp_path / "clouds.pt", tmp_path / "maps.pt"]
+    subprocess.run([sys.executable, "-c", code, *map(str, files)], cwd=ROOT, check=True)
+    for points, found in zip(given, torch.load(tmp_path / "maps.pt"), strict=True):
+        with torch.no_grad():
+            want = by_name(shipped, shipped(points, torch.zeros(len(points), dtype=torch.int64), 1))
+        assert not any(value.requires_grad for value in found.values())
+        assert_same_maps(found, want)
+
+
+def test_no_file_names_this_machine(exported: Path) -> None:
+    assert zipfile.is_zipfile(exported / "detector.pt2")
+    with zipfile.ZipFile(exported / "detector.pt2") as archive:
+        contents = [archive.read(name) for name in archive.namelist()]
+    assert any(b"hvnet.voxel_index" in content for content in contents)
+    for content in (*contents, *(path.read_bytes() for path in exported.iterdir())):
+        assert str(ROOT).encode() not in content
+        assert str(exported).encode() not in content
+
+
+def test_the_program_wants_two_points(exported: Path) -> None:
+    program = torch.export.load(exported / "detector.pt2").module()
+    for count in (0, 1):
+        points = torch.tensor([[5.0, 0.0, -1.0, 0.5], [-5.0, 0.0, -1.0, 0.5]])[:count]
+        with pytest.raises(RuntimeError, match=">= 2"):
+            program(points, torch.zeros(count, dtype=torch.int64))
+
+
+def test_a_program_for_two_clouds_and_scales_that_do_not_nest(tmp_path: Path) -> None:
+    model = lively("encoder.feature_scales=[0.5, 0.75, 2]", "encoder.vfe=plain")
+    write_program(model, tmp_path / "detector.pt2", 2)
+    assert all(weight.requires_grad for weight in model.parameters())
+    program = torch.export.load(tmp_path / "detector.pt2").module()
+    points, sample = clouds(model, 2, 650)
+    with torch.no_grad():
+        want = by_name(model, model(points, sample, 2))
+    assert_same_maps(program(points, sample), want)
+
+
+def test_a_config_that_drops_points_has_no_program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("onnx", reason="onnx is not installed: pip install '.[test]'")
+    model = lively("encoder.point_limit=1")
+    content = {"config": config_to_dict(model.config), "model": model.state_dict()}
+    save_checkpoint(tmp_path / "checkpoint.pt", content)
+    main(["--checkpoint", str(tmp_path / "checkpoint.pt"), "--out", str(tmp_path / "out")])
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"backbone_heads.onnx", "meta.json"}
+    assert "program: none; torch.export cannot take an encoder that drops points" in capsys.readouterr().out
+
+
+def examples() -> list[str]:
+    """The Python examples of the document."""
+    text = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")
+    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+
+
+def test_the_documents_examples(
+    exported: Path,
+    shipped: HVNet,
+    scenes: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """They run as they stand and find what the plain model finds."""
+    pytest.importorskip("onnxruntime", reason="onnxruntime is not installed: pip install '.[test]'")
+    points, sample = scene(scenes, 1)
+    points.numpy().astype(np.float32).tofile(tmp_path / "cloud.bin")
+    (tmp_path / "export").symlink_to(exported)
+    monkeypatch.chdir(tmp_path)
+    want = shipped.detect(points, sample, 1)[0]
+    scope: dict[str, Any] = {}
+    with_onnx, with_program = examples()
+    for example in (with_onnx, with_program):
+        exec(compile(example, "docs/deploy.md", "exec"), scope)
+        found = list(scope["boxes_of"](scope["maps"], 0))
+        labels = [torch.full((len(boxes),), k) for k, (_, boxes, _) in enumerate(found)]
+        boxes, scores = (torch.cat(column) for column in list(zip(*found, strict=True))[1:])
+        assert_same_boxes(Detections(boxes, scores, torch.cat(labels)), want)
+    printed = capsys.readouterr().out.splitlines()
+    assert len(printed) == len(want.boxes) + len(shipped.config.head.classes)
+    for k, entry in enumerate(shipped.config.head.classes):
+        assert f"{entry.name} {int((want.labels == k).sum())}" in printed
+    for name in ("compact", "demo", "hvnet"):
+        config = load_config(ROOT / "configs" / f"{name}.yaml")
+        for entry, described in zip(config.head.classes, describe(config, 1)["classes"], strict=True):
+            assert torch.equal(scope["anchors_of"](described), make_anchors(config, entry))
+
+
+def test_mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match=r"--batch 0: want 1 or more"):
+        main(["--batch", "0"])
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"pip install onnx"):
+        main(["--out", str(tmp_path / "out")])
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path, tmp_path / "file"):
+        with pytest.raises(InputError, match=f"{out}: is not empty"):
+            main(["--out", str(out)])
+    with pytest.raises(InputError, match=r"none\.pt: no such checkpoint"):
+        main(["--checkpoint", str(tmp_path / "none.pt"), "--out", str(tmp_path / "out")])
+    assert not (tmp_path / "out").exists()
