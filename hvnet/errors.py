@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
-from hvnet.cli import InputError, run_command
+from hvnet.cli import InputError, add_device, make_parser, run_command
 from hvnet.data.kitti import detections_to_labels, project_boxes, read_frame, read_image, read_split
 from hvnet.detector import Detector, load
 from hvnet.draw import CLASS_COLOURS, TRUTH_COLOUR, Camera, Subject, show_bev, show_camera
@@ -322,14 +322,15 @@ def _positive(text: str) -> int:
 
 def main(arguments: Sequence[str] | None) -> None:
     """The command."""
-    parser = argparse.ArgumentParser(
-        prog="python -m hvnet.errors",
-        description="Writes a page (HTML, all pictures inside) of a run: its evaluation in the validation split, its\n"
-        "curves, and the worst misses and false positives, in the image and from above.",
-        epilog="examples:\n  python -m hvnet.errors runs/demo\n"
-        "  python -m hvnet.errors runs/compact --data /data/kitti --count 50 --min-score 0.3\n"
-        "  python -m hvnet.errors model.pt --data /data/kitti --out model.html",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = make_parser(
+        "errors",
+        "Writes a page (HTML, all pictures inside) of a run: its evaluation in the validation split, its curves, and "
+        "the worst misses and false positives, in the image and from above.",
+        [
+            "runs/demo",
+            "runs/compact --data /data/kitti --count 50 --min-score 0.3",
+            "model.pt --data /data/kitti --out model.html",
+        ],
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run of hvnet.train, or a checkpoint")
     parser.add_argument("--data", type=Path, metavar="DIR", help="a KITTI root (default: the one that the run names)")
@@ -340,7 +341,7 @@ def main(arguments: Sequence[str] | None) -> None:
     parser.add_argument(
         "--min-score", type=_share, default=0.5, metavar="X", help="detections below do not count (default: 0.5)"
     )
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
+    add_device(parser)
     options = parser.parse_args(arguments)
 
     run = find_run(options.run)

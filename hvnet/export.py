@@ -6,7 +6,6 @@ points. Both end at the maps, whose size is fixed; meta.json says what decoding 
 worked examples.
 """
 
-import argparse
 import copy
 import importlib.util
 import json
@@ -19,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from hvnet.anchors import ORIENTATIONS, level_step
-from hvnet.cli import InputError, run_command
+from hvnet.cli import InputError, make_parser, run_command
 from hvnet.config import ClassConfig, Config
 from hvnet.detector import SHIPPED, fold_batch_norms
 from hvnet.encoder import projection_grids
@@ -170,15 +169,12 @@ def describe(config: Config, batch_size: int) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None) -> None:
     """The command."""
-    parser = argparse.ArgumentParser(
-        prog="python -m hvnet.export",
-        description="Writes a trained model for deployment: backbone_heads.onnx (pseudo-images to the heads' maps),\n"
-        "detector.pt2 (points to the heads' maps, a program of torch.export) and meta.json (anchors, thresholds).\n"
-        "docs/deploy.md says how to run them.",
-        epilog="examples:\n  python -m hvnet.export\n"
-        "  python -m hvnet.export --checkpoint runs/demo/checkpoint.pt --out deploy/demo\n"
-        "  python -m hvnet.export --batch 4 --out deploy/four",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = make_parser(
+        "export",
+        "Writes a trained model for deployment: backbone_heads.onnx (pseudo-images to the heads' maps), detector.pt2 "
+        "(points to the heads' maps, a program of torch.export) and meta.json (anchors, thresholds). docs/deploy.md "
+        "says how to run them.",
+        ["", "--checkpoint runs/demo/checkpoint.pt --out deploy/demo", "--batch 4 --out deploy/four"],
     )
     parser.add_argument(
         "--checkpoint", type=Path, metavar="FILE", help="of python -m hvnet.train (default: the weights of the package)"

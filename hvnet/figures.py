@@ -4,7 +4,6 @@ A KITTI frame's camera picture above its bird's eye view, other clouds from abov
 projection scale, of one model or of two side by side.
 """
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
@@ -12,7 +11,7 @@ from typing import get_args
 import torch
 from tqdm import tqdm
 
-from hvnet.cli import InputError, run_command
+from hvnet.cli import InputError, add_device, make_parser, run_command
 from hvnet.data.clouds import SUFFIXES
 from hvnet.detect import Source, camera_of, find_sources, read_source
 from hvnet.detector import Detector, load
@@ -46,16 +45,17 @@ def draw_source(source: Source, detector: Detector, path: Path, colour: Colour) 
 
 def main(arguments: Sequence[str] | None) -> None:
     """The command."""
-    parser = argparse.ArgumentParser(
-        prog="python -m hvnet.figures",
-        description="Draws clouds with their boxes of score 0.5 or more: of a KITTI frame the image (or, without one,\n"
-        "the points as the camera sees them) above the bird's eye view, of other clouds the latter alone.\n"
-        "With --features also the pseudo-images of every projection scale.",
-        epilog="examples:\n  python -m hvnet.figures cloud.bin\n"
-        "  python -m hvnet.figures /data/kitti --split val --format pdf\n"
-        "  python -m hvnet.figures cloud.bin --features --checkpoint runs/demo/checkpoint.pt\n"
-        "  python -m hvnet.figures cloud.bin --features --checkpoint with.pt --compare without.pt",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = make_parser(
+        "figures",
+        "Draws clouds with their boxes of score 0.5 or more: of a KITTI frame the image (or, without one, the points "
+        "as the camera sees them) above the bird's eye view, of other clouds the latter alone. With --features also "
+        "the pseudo-images of every projection scale.",
+        [
+            "cloud.bin",
+            "/data/kitti --split val --format pdf",
+            "cloud.bin --features --checkpoint runs/demo/checkpoint.pt",
+            "cloud.bin --features --checkpoint with.pt --compare without.pt",
+        ],
     )
     parser.add_argument(
         "inputs", nargs="+", type=Path, metavar="INPUT", help=f"files ({', '.join(SUFFIXES)}), folders, KITTI roots"
@@ -63,7 +63,9 @@ def main(arguments: Sequence[str] | None) -> None:
     parser.add_argument(
         "--checkpoint", type=Path, metavar="FILE", help="of python -m hvnet.train (default: the weights of the package)"
     )
-    parser.add_argument("--split", help="frames of ImageSets/SPLIT.txt of a KITTI root (default: all frames)")
+    parser.add_argument(
+        "--split", metavar="NAME", help="frames of ImageSets/NAME.txt of a KITTI root (default: all frames)"
+    )
     parser.add_argument("--features", action="store_true", help="draw pseudo-images, too, as NAME-features")
     parser.add_argument(
         "--compare", type=Path, metavar="FILE", help="a second checkpoint, whose pseudo-images stand beside"
@@ -71,7 +73,7 @@ def main(arguments: Sequence[str] | None) -> None:
     parser.add_argument("--colour", choices=get_args(Colour), default="height", help="of the points (default: height)")
     parser.add_argument("--out", type=Path, default=Path("figures"), metavar="DIR", help="(default: figures)")
     parser.add_argument("--format", choices=FORMATS, default="png", help="(default: png)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
+    add_device(parser)
     options = parser.parse_args(arguments)
 
     if options.out.exists() and (not options.out.is_dir() or any(options.out.iterdir())):

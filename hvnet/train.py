@@ -621,7 +621,8 @@ def main(arguments: Sequence[str] | None) -> None:
     parser = make_parser(
         "train",
         "Trains HVNet, validates it as KITTI does, and writes checkpoint.pt, metrics.jsonl, tensorboard/, pictures/ "
-        "and data.txt (where the data are) to the run's folder. To train on 8 GPUs, put torchrun --nproc-per-node 8 in the place of python.",
+        "and data.txt (where the data are) to the run's folder. To train on 8 GPUs, put torchrun --nproc-per-node 8 "
+        "in the place of python.",
         [
             "",
             "--config configs/compact.yaml --data /data/kitti --set train.batch_size=2",

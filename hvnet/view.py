@@ -3,7 +3,6 @@
 The page is viser's (the extra `view`): this process serves it, and answers its buttons, keys and sliders.
 """
 
-import argparse
 import contextlib
 import html
 import importlib.util
@@ -23,20 +22,21 @@ import torch
 from matplotlib import colormaps
 from matplotlib.colors import to_hex, to_rgb
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
 from hvnet.boxes import box_corners
-from hvnet.cli import InputError, run_command
+from hvnet.cli import InputError, add_device, make_parser, run_command
 from hvnet.data.clouds import SUFFIXES, read_cloud
-from hvnet.data.kitti import EDGES, Frame, read_frame
+from hvnet.data.kitti import EDGES, Frame, read_frame, read_image
 from hvnet.data.synthetic import Options, generate
 from hvnet.detect import Source, find_sources
 from hvnet.detector import Detector, load
 from hvnet.draw import CLASS_COLOURS, SHOWN_SCORE, TRUTH_COLOUR
+from hvnet.encoder import HybridVoxelEncoder
 from hvnet.kernels.voxel import Grid, voxel_index
 from hvnet.mistakes import MISS, Mistake, find_mistakes, worst
 from hvnet.model import Detections
+from hvnet.pillars import PillarEncoder
 
 with contextlib.suppress(ImportError):  # the extra `view`; only the page wants it
     import rich
@@ -78,10 +78,7 @@ def read_scene(source: Source) -> Scene:
     frame = read_frame(source.path, source.name, source.split_dir, labelled=labelled)
     image, path = None, source.kitti_file("image_2", ".png")
     if path is not None:
-        try:
-            image = np.asarray(Image.open(path).convert("RGB"))
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read as an image ({error})") from error
+        image = read_image(path)
     return Scene(frame.points, frame if labelled else None, image, [frame.note] if frame.note else [])
 
 
@@ -107,6 +104,13 @@ def box_lines(boxes: Tensor) -> NDArray[np.float32]:
     corners = box_corners(boxes).numpy()  # (M, 8, 3)
     heading = np.stack((corners[:, 4:].mean(axis=1), corners[:, 4:6].mean(axis=1)), axis=1)
     return np.concatenate((corners[:, EDGES], heading[:, None]), axis=1)
+
+
+def grids_of(encoder: HybridVoxelEncoder | PillarEncoder) -> tuple[list[Grid], list[Grid]]:
+    """The grids of an encoder's features and of its pseudo-images; pillars have one for both."""
+    if isinstance(encoder, PillarEncoder):
+        return [encoder.grid], [encoder.grid]
+    return encoder.feature_grids, encoder.projection_grids
 
 
 def points_per_voxel(points: Tensor, grid: Grid) -> Tensor:
@@ -180,9 +184,9 @@ class Viewer:
         self.mistakes: dict[int, list[Mistake]] = {}  # of every labelled frame that was examined
         self.listed: tuple[list[Mistake], list[Mistake]] = [], []
 
-        encoder = detector.encoder.encoder
-        self.voxels = {f"points in its {grid.cell[0]:g} m voxel": grid for grid in encoder.feature_grids}
-        self.images = {f"{grid.cell[0]:g} m": grid for grid in encoder.projection_grids}
+        feature_grids, projection_grids = grids_of(detector.encoder.encoder)
+        self.voxels = {f"points in its {grid.cell[0]:g} m voxel": grid for grid in feature_grids}
+        self.images = {f"{grid.cell[0]:g} m": grid for grid in projection_grids}
         self.colours = dict(zip(detector.classes, itertools.cycle(map(brighter, CLASS_COLOURS)), strict=False))
 
         server.initial_camera.position, server.initial_camera.look_at = START
@@ -412,17 +416,17 @@ def choose_data(given: Path | None, root: Path | None, checkpoint: Path | None) 
 
 def main(arguments: Sequence[str] | None) -> None:
     """The command."""
-    parser = argparse.ArgumentParser(
-        prog="python -m hvnet.view",
-        description="Shows clouds in the browser, with labels, detections and what the detector gets wrong.\n"
-        "Without INPUT it shows generated scenes.",
-        epilog="examples:\n  python -m hvnet.view\n"
-        "  python -m hvnet.view cloud.pcd\n"
-        "  python -m hvnet.view clouds/ --checkpoint runs/demo/checkpoint.pt\n"
-        "  python -m hvnet.view /data/kitti --split val\n"
-        "  python -m hvnet.view runs/compact --data /data/kitti --split val\n"
-        "for clouds on another machine:\n  ssh -L 8080:localhost:8080 MACHINE, then python -m hvnet.view there",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = make_parser(
+        "view",
+        "Shows clouds in the browser, with labels, detections and what the detector gets wrong. Without INPUT it shows "
+        "generated scenes. For clouds on another machine: ssh -L 8080:localhost:8080 MACHINE, and this command there.",
+        [
+            "",
+            "cloud.pcd",
+            "clouds/ --checkpoint runs/demo/checkpoint.pt",
+            "/data/kitti --split val",
+            "runs/compact --data /data/kitti --split val",
+        ],
     )
     parser.add_argument(
         "input",
@@ -436,9 +440,9 @@ def main(arguments: Sequence[str] | None) -> None:
     )
     parser.add_argument("--data", type=Path, metavar="DIR", help="for a run: a KITTI root (default: generated scenes)")
     parser.add_argument("--split", metavar="NAME", help="frames of ImageSets/NAME.txt of a KITTI root (default: all)")
-    parser.add_argument("--port", type=int, default=8080, help="or the next that is free (default: 8080)")
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: 127.0.0.1)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
+    parser.add_argument("--port", type=int, default=8080, metavar="N", help="or the next that is free (default: 8080)")
+    parser.add_argument("--host", default="127.0.0.1", metavar="NAME", help="address to listen at (default: 127.0.0.1)")
+    add_device(parser)
     options = parser.parse_args(arguments)
 
     if importlib.util.find_spec("viser") is None:

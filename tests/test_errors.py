@@ -117,6 +117,15 @@ def test_the_page_holds_a_crop_of_every_mistake(run: Path, scenes: Path, tmp_pat
         assert name in page.text
 
 
+def test_a_page_of_pillars(pillars: Path, scenes: Path, tmp_path: Path) -> None:
+    """An untrained model finds nothing: all is missed."""
+    out = tmp_path / "page.html"
+    main([str(pillars), "--data", str(scenes), "--out", str(out), "--count", "2", "--device", "cpu"])
+    page = Page(out.read_text(encoding="utf-8"))
+    assert len(page.images("crop")) == 2
+    assert "0 false positives" in page.text
+
+
 def test_nothing_comes_from_elsewhere(run: Path) -> None:
     """The page is written to the run's folder, and all that it shows is inside."""
     main([str(run), "--count", "1", "--device", "cpu"])

@@ -13,7 +13,7 @@ from PIL import Image
 from hvnet.cli import InputError
 from hvnet.config import config_to_dict, load_config
 from hvnet.data.kitti import read_frame
-from hvnet.detector import Detector
+from hvnet.detector import Detector, load
 from hvnet.figures import features_of, main
 from hvnet.model import HVNet, load_checkpoint, model_from_checkpoint, save_checkpoint
 
@@ -59,6 +59,15 @@ def test_features_of_two_models(checkpoints: list[Path], scenes: Path, tmp_path:
     both = ["--checkpoint", str(checkpoints[0]), "--compare", str(checkpoints[1])]
     main([cloud, *both, "--features", "--out", str(tmp_path), "--format", suffix, "--device", "cpu"])
     assert {path.name for path in tmp_path.iterdir()} == {f"000001.{suffix}", f"000001-features.{suffix}"}
+
+
+def test_pillars_have_one_pseudo_image(pillars: Path, scenes: Path, tmp_path: Path) -> None:
+    cloud = scenes / "training" / "velodyne" / "000001.bin"
+    main([str(cloud), "--features", "--checkpoint", str(pillars), "--out", str(tmp_path), "--device", "cpu"])
+    assert {path.name for path in tmp_path.iterdir()} == {"000001.png", "000001-features.png"}
+    found = features_of(load(pillars, "cpu"), read_frame(scenes, "000001").points, "pillars")
+    assert [tuple(image.shape[-2:]) for image in found.images] == [(160, 160)]
+    assert found.cells == [(0.16, 0.16)]
 
 
 def test_features_are_those_of_the_encoder(checkpoints: list[Path], scenes: Path) -> None:

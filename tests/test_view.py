@@ -283,6 +283,20 @@ def test_all_colours_and_pseudo_images_can_be_drawn(viewer: Viewer) -> None:
     assert scene.get_handle_by_name("/pseudo-image") is None
 
 
+def test_pillars_have_one_grid(pillars: Path, scenes: Path) -> None:
+    pytest.importorskip("viser")
+    server = start_server("127.0.0.1", 0)
+    try:
+        viewer = Viewer(server, load(pillars, "cpu"), find_sources([scenes], None))
+        assert viewer.colour.options[2:] == ("points in its 0.16 m voxel",)
+        assert viewer.overlay.options[1:] == ("0.16 m",)
+        viewer.colour.value, viewer.overlay.value = viewer.colour.options[2], viewer.overlay.options[1]
+        node: Any = server.scene.get_handle_by_name("/pseudo-image")
+        np.testing.assert_allclose((node.render_width, node.render_height, *node.position[:2]), (25.6, 25.6, 12.8, 0))
+    finally:
+        server.stop()
+
+
 def test_the_worst_mistakes_are_listed_and_shown(viewer: Viewer) -> None:
     viewer.search()
     assert "6 of 6 labelled frames searched at score 0.5" in viewer.progress.content
