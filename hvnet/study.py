@@ -436,11 +436,13 @@ def draw_speed(path: Path, times: dict[str, Times], device: str) -> None:
         for stage, value, colour in zip(STAGES, stages, colours, strict=True):
             share = 100 * value / sum(stages)
             axes.barh(k, share, left=left, color=colour, label=stage if k == 0 else None)
-            axes.text(left + share / 2, k, f"{value:.0f} ms", ha="center", va="center", fontsize=8, color="white")
+            if share > 6:  # or the text finds no room
+                axes.text(left + share / 2, k, f"{value:.0f} ms", ha="center", va="center", fontsize=8, color="white")
             left += share
     axes.set_yticks(range(len(bars)), [label for label, _ in bars])
     axes.invert_yaxis()
-    axes.set_xlabel(f"share of the time (%); {device}, but the last: RTX 2080 Ti")
+    axes.set_xlim(0, 100)
+    axes.set_xlabel(f"share of the time (%)\n{device}; the last: RTX 2080 Ti")
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False, fontsize=8)
     figure.savefig(path, dpi=110)
 

@@ -64,7 +64,14 @@ def place(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     content = {"config": config_to_dict(config), "model": HVNet(config).state_dict()}
     for name in ("model.pt", "with.pt", "without.pt"):
         save_checkpoint(folder / name, content)
-    for run, name in (("demo", "demo"), ("compact", "compact"), ("hvnet", "hvnet"), ("mine", "compact")):
+    for run, name in (
+        ("demo", "demo"),
+        ("compact", "compact"),
+        ("hvnet", "hvnet"),
+        ("mine", "compact"),
+        ("with", "demo"),
+        ("without", "demo"),
+    ):
         given = ["--config", str(ROOT / "configs" / f"{name}.yaml"), "--data", str(folder / "KITTI")]
         once = [part for each in ONCE for part in ("--set", each)]
         train.main([*given, "--out", str(folder / "runs" / run), "--device", "cpu", *SETTINGS, *once])
