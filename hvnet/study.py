@@ -13,6 +13,7 @@ import hashlib
 import itertools
 import json
 import math
+import textwrap
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -158,6 +159,21 @@ class Outcome(NamedTuple):
     def mean_ap(self, level: int = 1) -> float:
         """BEV mAP in % of easy, moderate or hard objects, over the classes that the frames hold."""
         return mean_of([table["bev"][level] for table in self.scores.values()])
+
+
+def short_table(study: Study, outcomes: Sequence[Outcome], times: dict[str, Times]) -> list[str]:
+    """What of a study fits a terminal: mAP, or the stages where nothing is trained, and the time."""
+    stages = [stage.replace(" and", ",") for stage in STAGES]
+    what = ["mAP, mean", "paper's", "ms a cloud"] if outcomes else [*stages, "ms a cloud", "2080 Ti, ms"]
+    wide = max(len(row.label) for row in study.rows)
+    lines = [" " * wide + "".join(f"{title:>12}" for title in what)]
+    for row in study.rows:
+        if row.name in times:
+            own = [outcome.mean_ap() for outcome in outcomes if outcome.row.name == row.name]
+            whole = sum(times[row.name])
+            values = [mean_of(own), row.paper, whole] if outcomes else [*times[row.name], whole, row.paper]
+            lines.append(f"{row.label:<{wide}}" + "".join(f"{shown(value):>12}" for value in values))
+    return lines
 
 
 def mean_of(values: Sequence[float | None]) -> float:
@@ -619,7 +635,9 @@ def run_study(name: str, options: argparse.Namespace) -> None:
     where |= {"real frames": len(real), "timed on": describe(device)}
     write_csv(options.out / f"{name}.csv", name, outcomes, times, where)
     (options.out / f"{name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print("\n".join(lines) + "\n")
+    print(
+        "\n" + "\n".join(textwrap.fill(line, 100) for line in short_table(study, outcomes, times) + lines[-1:]) + "\n"
+    )
     for suffix, title in (("md", "table"), ("csv", "rows"), ("png", "picture")):
         print(f"{title + ':':<9}{options.out / f'{name}.{suffix}'}")
 
