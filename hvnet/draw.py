@@ -77,7 +77,7 @@ def draw_bev(path: Path, subject: Subject, point_range: Sequence[float], title: 
     figure = Figure(figsize=(WIDTH, 0.9 + _bev_height(point_range)), layout="constrained")
     axes = figure.add_subplot()
     _whole_bev(axes, subject.at_score(SHOWN_SCORE), point_range, colour)
-    axes.set_title(f"{title}, score ≥ {SHOWN_SCORE}")
+    axes.set_title(f"{title}, score ≥ {SHOWN_SCORE}", parse_math=False)
     _write(figure, path, dpi=110)
 
 
@@ -97,7 +97,7 @@ def draw_frame(
     points = show_camera(above, subject, camera)
     if points is not None:
         _colour_bar(points, above.inset_axes((0.77, 0.91, 0.2, 0.03)), "depth (m)")
-    above.set_title(f"{title}, score ≥ {SHOWN_SCORE}")
+    above.set_title(f"{title}, score ≥ {SHOWN_SCORE}", parse_math=False)
     _whole_bev(below, subject, point_range, colour)
     _write(figure, path, dpi=150)
 
@@ -120,8 +120,8 @@ def draw_features(path: Path, models: Sequence[Features], title: str) -> None:
                 _show_feature(axes[row, column], values, cell, model.corner, column < len(models))
                 what = "first channel" if column < len(models) else "norm"
                 lines = f"{model.name}\n" if len(models) > 1 else ""
-                axes[row, column].set_title(f"{lines}{what}, cells of {cell[0]:g} m", fontsize=9)
-    figure.suptitle(title)
+                axes[row, column].set_title(f"{lines}{what}, cells of {cell[0]:g} m", fontsize=9, parse_math=False)
+    figure.suptitle(title, parse_math=False)
     _write(figure, path, dpi=110)
 
 

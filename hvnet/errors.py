@@ -124,7 +124,11 @@ def find_run(path: Path) -> Run:
         raise InputError(f"{path}: no such run; give the folder of a run of hvnet.train, or a checkpoint")
     checkpoint = path / "checkpoint.pt" if path.is_dir() else path
     data = checkpoint.parent / "data.txt"
-    root = Path(data.read_text(encoding="utf-8").strip()) if data.is_file() else None
+    try:
+        named = data.read_text(encoding="utf-8").strip() if data.is_file() else ""
+    except UnicodeDecodeError as error:
+        raise InputError(f"{data}: is no text that names a KITTI root; remove it, and give --data") from error
+    root = Path(named) if named else None
     return Run(checkpoint, _read_metrics(checkpoint.parent / "metrics.jsonl"), root)
 
 
@@ -135,7 +139,9 @@ def _read_metrics(path: Path) -> list[dict[str, Any]]:
         try:
             record = json.loads(line)
             record["epoch"]
-        except (ValueError, KeyError, TypeError) as error:
+            for table in record.get("validation", {}).values():
+                table["exact"]
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"{path}:{number}: no record of hvnet.train; remove the line") from error
         records.append(record)
     return records
@@ -307,17 +313,19 @@ def make_page(run: Run, detector: Detector, root: Path, count: int, min_score: f
 
 
 def _share(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
     if not 0 <= value <= 1:
         raise argparse.ArgumentTypeError(f"{text} is no score: want a number from 0 to 1")
     return value
 
 
 def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
+    if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text} is no count: want 1 or more")
-    return value
+    return int(text)
 
 
 def main(arguments: Sequence[str] | None) -> None:
@@ -351,6 +359,8 @@ def main(arguments: Sequence[str] | None) -> None:
     out = options.out or (options.run if options.run.is_dir() else Path()) / "errors.html"
     if out.is_dir():
         raise InputError(f"{out}: is a folder; --out names the page, such as {out / 'errors.html'}")
+    if not out.parent.is_dir() and (out.parent.exists() or not out.parent.parent.is_dir()):
+        raise InputError(f"{out.parent}: no folder; --out names the page, such as errors.html")
     page = make_page(run, load(run.checkpoint, options.device), root, options.count, options.min_score)
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(page, encoding="utf-8")

@@ -197,7 +197,10 @@ def main(arguments: Sequence[str] | None) -> None:
 
     path = options.checkpoint or SHIPPED
     model = model_from_checkpoint(load_checkpoint(path), str(path))
-    options.out.mkdir(parents=True, exist_ok=True)
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{options.out}: cannot be made a folder ({error.strerror}); give another --out") from error
     meta = options.out / "meta.json"
     meta.write_text(json.dumps(describe(model.config, options.batch), indent=2) + "\n", encoding="utf-8")
     print(f"meta:    {meta}")

@@ -334,8 +334,10 @@ def agreement(outcomes: Sequence[Outcome]) -> tuple[int, int, float]:
     """Of how many pairs of rows all seeds agree which is better, of how many pairs, and how far the seeds of a row are
     apart in the median, in points of mAP."""
     of_row: dict[str, list[float]] = {}
+    seen: set[Path] = set()
     for outcome in outcomes:
-        if not math.isnan(outcome.mean_ap()):
+        if outcome.checkpoint not in seen and not math.isnan(outcome.mean_ap()):  # two rows may be one training
+            seen.add(outcome.checkpoint)
             of_row.setdefault(outcome.row.name, []).append(outcome.mean_ap())
     alike = pairs = 0
     for a, b in itertools.combinations(of_row.values(), 2):

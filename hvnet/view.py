@@ -33,6 +33,7 @@ from hvnet.detect import Source, find_sources
 from hvnet.detector import Detector, load
 from hvnet.draw import CLASS_COLOURS, SHOWN_SCORE, TRUTH_COLOUR
 from hvnet.encoder import HybridVoxelEncoder
+from hvnet.errors import find_run
 from hvnet.kernels.voxel import Grid, voxel_index
 from hvnet.mistakes import MISS, Mistake, find_mistakes, worst
 from hvnet.model import Detections
@@ -408,7 +409,7 @@ def choose_data(given: Path | None, root: Path | None, checkpoint: Path | None) 
     if given is not None and (given / "checkpoint.pt").is_file():
         if checkpoint is not None:
             raise InputError(f"--checkpoint: the run {given} has its own; leave one of them out")
-        return root, given / "checkpoint.pt"
+        return root or find_run(given).root, given / "checkpoint.pt"
     if root is not None:
         raise InputError("--data: goes with the folder of a run, which holds checkpoint.pt; give the root as INPUT")
     return given, checkpoint
@@ -438,7 +439,7 @@ def main(arguments: Sequence[str] | None) -> None:
     parser.add_argument(
         "--checkpoint", type=Path, metavar="FILE", help="of python -m hvnet.train (default: the weights of the package)"
     )
-    parser.add_argument("--data", type=Path, metavar="DIR", help="for a run: a KITTI root (default: generated scenes)")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="for a run: a KITTI root (default: that of the run)")
     parser.add_argument("--split", metavar="NAME", help="frames of ImageSets/NAME.txt of a KITTI root (default: all)")
     parser.add_argument("--port", type=int, default=8080, metavar="N", help="or the next that is free (default: 8080)")
     parser.add_argument("--host", default="127.0.0.1", metavar="NAME", help="address to listen at (default: 127.0.0.1)")

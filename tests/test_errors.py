@@ -4,6 +4,7 @@ import base64
 import io
 import json
 import re
+import shutil
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -177,6 +178,9 @@ def test_descriptions() -> None:
         (["{checkpoint}"], "does not name the data that it was trained on; give a KITTI root with --data"),
         (["{run}", "--data", "{empty}"], "val.txt: no such file"),
         (["{run}", "--out", "{empty}"], "is a folder; --out names the page"),
+        (["{binary}"], "data.txt: is no text that names a KITTI root"),
+        (["{shallow}", "--data", "{empty}"], "metrics.jsonl:1: no record of hvnet.train; remove the line"),
+        (["{run}", "--out", "{run}/checkpoint.pt/x.html"], "checkpoint.pt: no folder; --out names the page"),
         (["{broken}", "--data", "{empty}"], "metrics.jsonl:2: no record of hvnet.train; remove the line"),
     ],
 )
@@ -185,14 +189,22 @@ def test_mistakes_of_the_user(run: Path, tmp_path: Path, arguments: list[str], m
         (tmp_path / name).mkdir()
     for name in ("broken", "alone"):
         (tmp_path / name / "checkpoint.pt").write_bytes((run / "checkpoint.pt").read_bytes())
+    for name, data in (("binary", b"\xff\xfe"), ("shallow", None)):
+        (tmp_path / name).mkdir()
+        shutil.copy(run / "checkpoint.pt", tmp_path / name)
+        if data:
+            (tmp_path / name / "data.txt").write_bytes(data)
+    (tmp_path / "shallow" / "metrics.jsonl").write_text('{"epoch": 1, "validation": {"Car": {}}}\n')
     (tmp_path / "broken" / "metrics.jsonl").write_text(json.dumps(METRICS[0]) + '\n{"epo')
     places = {"run": run, "checkpoint": tmp_path / "alone" / "checkpoint.pt"}
-    places |= {name: tmp_path / name for name in ("empty", "broken")}
+    places |= {name: tmp_path / name for name in ("empty", "broken", "binary", "shallow")}
     with pytest.raises(InputError, match=re.escape(message)):
         main([each.format(**places) for each in [*arguments, "--device", "cpu"]])
 
 
-@pytest.mark.parametrize("option", [["--count", "0"], ["--count", "a"], ["--min-score", "2"], ["--min-score", "nan"]])
+@pytest.mark.parametrize(
+    "option", [["--count", "0"], ["--count", "a"], ["--min-score", "x"], ["--min-score", "2"], ["--min-score", "nan"]]
+)
 def test_options_that_mean_nothing(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as raised:
         main(["missing", *option])

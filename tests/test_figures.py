@@ -53,6 +53,16 @@ def test_figures_of_clouds_and_frames(checkpoints: list[Path], scenes: Path, tmp
         assert image.width == 1200
 
 
+def test_names_are_no_formulas(checkpoints: list[Path], scenes: Path, tmp_path: Path) -> None:
+    """A legal file name that would be a mistake in matplotlib's mathematical text."""
+    cloud = tmp_path / "a$_$.bin"
+    shutil.copy(scenes / "training" / "velodyne" / "000001.bin", cloud)
+    odd = shutil.copy(checkpoints[0], tmp_path / "b$^$.pt")
+    both = ["--checkpoint", str(odd), "--compare", str(checkpoints[1])]
+    main([str(cloud), *both, "--features", "--out", str(tmp_path / "out"), "--device", "cpu"])
+    assert len(list((tmp_path / "out").iterdir())) == 2
+
+
 @pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
 def test_features_of_two_models(checkpoints: list[Path], scenes: Path, tmp_path: Path, suffix: str) -> None:
     cloud = str(scenes / "training" / "velodyne" / "000001.bin")

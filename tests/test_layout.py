@@ -56,7 +56,7 @@ ALLOWED = {f"kernels.{name}": allowed for name, allowed in KERNELS.items()} | {
     "detect": NETWORK | DATA | {"model", "detector", "draw", "evaluate"},
     "export": {"config", "anchors", "encoder", "head", "model", "detector"},
     "study": ANY_KERNEL | NETWORK | DATA | {"model", "detector", "evaluate", "matching", "train"},
-    "view": NETWORK | DATA | {"kernels.voxel", "model", "detector", "draw", "mistakes", "detect"},
+    "view": NETWORK | DATA | {"kernels.voxel", "model", "detector", "draw", "mistakes", "detect", "errors"},
 }
 
 

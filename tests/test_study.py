@@ -126,7 +126,7 @@ def outcome(row: str, seed: int, ap: float) -> Outcome:
         "Pedestrian": {"bev": [90.0, ap + 1, 0.0], "3d": [7.0] * 3, "aos": [8.0] * 3},
         "Cyclist": {measure: [None] * 3 for measure in ("bev", "3d", "aos")},
     }
-    return Outcome(Row(row, row), seed, Path(), 1, 1.0, 1, "cpu", 0.0, scores)
+    return Outcome(Row(row, row), seed, Path(f"{row}-{seed}"), 1, 1.0, 1, "cpu", 0.0, scores)
 
 
 def test_agreement_of_seeds() -> None:
@@ -137,6 +137,8 @@ def test_agreement_of_seeds() -> None:
     assert agreement(outcomes) == (2, 3, 1.0)
     assert outcomes[0].mean_ap() == 1.0
     assert outcomes[0].mean_ap(level=0) == 45.0
+    shared = [each._replace(row=Row("d", "d")) for each in outcomes if each.row.name == "a"]
+    assert agreement(outcomes + shared) == (2, 3, 1.0)  # a row that is another's training is no further row
     even = [outcome(row, seed, 5.0) for seed in range(2) for row in "ab"]
     assert agreement(even) == (0, 1, 0.0)  # a tie is no order
     empty = outcome("a", 0, 5.0)._replace(scores={"Car": {"bev": [None] * 3}})

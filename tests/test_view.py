@@ -201,6 +201,8 @@ def test_a_run_brings_its_checkpoint(tmp_path: Path) -> None:
         (run, root, None): (root, run / "checkpoint.pt"),
     }.items():
         assert choose_data(*given) == wanted
+    (run / "data.txt").write_text(f"{root}\n")
+    assert choose_data(run, None, None) == (root, run / "checkpoint.pt")
 
 
 # --- the controls, without a browser ---------------------------------------------------------------------------------

@@ -390,7 +390,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB"))
     except OSError as error:
-        raise InputError(f"{path}: not an image, or cut off") from error
+        raise InputError(f"{path}: not an image, or cut off; replace or remove it") from error
 
 
 def _image_size(path: Path) -> tuple[int, int]:
@@ -400,7 +400,7 @@ def _image_size(path: Path) -> tuple[int, int]:
         with Image.open(path) as image:  # reads the header only
             return image.size
     except OSError as error:
-        raise InputError(f"{path}: not an image") from error
+        raise InputError(f"{path}: not an image; replace or remove it") from error
 
 
 def _read_lines(path: Path, content: str) -> list[str]:
