@@ -20,6 +20,7 @@ from hvnet.cli import InputError
 from hvnet.config import config_to_dict, load_config
 from hvnet.data.kitti import read_frame, read_split
 from hvnet.model import HVNet, save_checkpoint
+from hvnet.study import STUDIES
 from tests.test_layout import ROOT
 from tests.test_study import QUICK, SMALL
 
@@ -96,7 +97,8 @@ def shortened(module: str, arguments: list[str], out: str) -> list[str]:
         return [*arguments, *([] if "--resume" in arguments else ["--out", out]), *SETTINGS, *once]
     if module == "study":
         once = [] if "speed" in arguments else ["--budget", "steps=1", "--seeds", "1"]
-        return [*arguments, *SETTINGS, *once, "--out", out]
+        once += ["--rows", STUDIES[arguments[0]].rows[0].name] if arguments[0] in STUDIES else []
+        return [*arguments, *SETTINGS, "--set", "train.workers=0", *once, "--out", out]
     if module == "data.synthetic":
         return [*arguments, "--train", "1", "--val", "1", "--out", out]
     if module in ("detect", "figures", "export"):
