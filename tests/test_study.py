@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 import shutil
 import signal
@@ -298,8 +299,9 @@ def test_a_study_that_is_stopped_goes_on(tmp_path: Path, scenes: Path) -> None:
     given = ["loss", "--rows", "corners", "--seeds", "1", "--data", str(scenes), "--device", "cpu", "--budget"]
     given += ["epochs=12", *(part for each in (*SMALL, *QUICK) for part in ("--set", each))]
     command = [sys.executable, "-m", "hvnet.study", *given, "--out", str(tmp_path / "a")]
+    environment = os.environ | {"OMP_NUM_THREADS": str(torch.get_num_threads())}  # the bits depend on it
     process = subprocess.Popen(
-        command, cwd=CONFIGS.parent, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        command, cwd=CONFIGS.parent, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )
     while process.poll() is None and not list((tmp_path / "a" / "rows").glob("*/checkpoint.pt")):
         time.sleep(0.1)
