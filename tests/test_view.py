@@ -434,7 +434,10 @@ def test_the_page_in_a_browser(tmp_path: Path) -> None:
     if CHROMIUM is None:
         pytest.skip("no Chromium")
     command = [sys.executable, "-m", "hvnet.view", "--port", "0", "--device", "cpu"]
+    # a shell's background jobs ignore SIGINT, and so would the command that they start
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    signal.signal(signal.SIGINT, before)
     try:
         assert process.stdout
         line = process.stdout.readline()
