@@ -29,7 +29,7 @@ from hvnet.cli import InputError, add_device, make_parser, run_command
 from hvnet.data.kitti import detections_to_labels, project_boxes, read_frame, read_image, read_split
 from hvnet.detector import Detector, load
 from hvnet.draw import CLASS_COLOURS, TRUTH_COLOUR, Camera, Subject, show_bev, show_camera
-from hvnet.evaluate import MIN_OVERLAPS, evaluate, format_table
+from hvnet.evaluate import CLASSES, MIN_OVERLAPS, evaluate, format_table
 from hvnet.kernels.rotated import rotated_iou_bev
 from hvnet.mistakes import MISS, Mistake, find_mistakes, worst
 from hvnet.model import Detections
@@ -270,6 +270,9 @@ def summary_rows(result: dict[str, dict[str, Any]], measures: Sequence[str]) -> 
 
 def make_page(run: Run, detector: Detector, root: Path, count: int, min_score: float) -> str:
     """Detects in the validation split of a KITTI root, and writes the page, with `count` mistakes of each kind."""
+    scored = [name for name in detector.classes if name in CLASSES]
+    if not scored:
+        raise InputError(f"{run.checkpoint}: finds none of {', '.join(CLASSES)}, and no other class is scored")
     names = read_split(root, "val")
     detections: dict[str, Detections] = {}
     labels, rows, mistakes = [], [], []
@@ -280,7 +283,7 @@ def make_page(run: Run, detector: Detector, root: Path, count: int, min_score: f
         labels.append(frame.labels)
         rows.append(detections_to_labels(found.boxes, found.scores, classes, frame.calib, frame.image_size))
         mistakes += find_mistakes(frame, found, detector.classes, min_score)
-    result = evaluate(labels, rows, classes=detector.classes)
+    result = evaluate(labels, rows, classes=scored)
     chosen = worst(mistakes, count)
     bar = tqdm([each for kind in chosen for each in kind], desc="drawing", unit="crop", dynamic_ncols=True)
     crops = [make_crop(each, detector, root, detections[each.frame], min_score) for each in bar]

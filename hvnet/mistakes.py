@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hvnet.boxes import points_in_boxes
 from hvnet.data.kitti import Frame, project_boxes
-from hvnet.evaluate import MIN_OVERLAPS
+from hvnet.evaluate import CLASSES, MIN_OVERLAPS
 from hvnet.kernels.rotated import rotated_iou_bev
 from hvnet.matching import NEIGHBOURS
 from hvnet.model import Detections
@@ -34,6 +34,8 @@ class Mistake(NamedTuple):
 def find_mistakes(frame: Frame, detections: Detections, classes: Sequence[str], min_score: float) -> list[Mistake]:
     """The mistakes of a frame's detections (M boxes, labels that index `classes`): misses first, class by class.
 
+    Only the classes that KITTI scores have mistakes.
+
     A labelled box of one of the classes is missed if no detection of its class with score >= min_score reaches KITTI's
     BEV IoU of the class (0.7 for Car, 0.5 else). A miss with an overlap above it was found, with a lower score.
 
@@ -53,6 +55,8 @@ def find_mistakes(frame: Frame, detections: Detections, classes: Sequence[str], 
         found[kind] += [Mistake(frame.id, kind, name, *row) for row in rows]
 
     for label, name in enumerate(classes):
+        if name not in CLASSES:  # there is no overlap that it would have to reach
+            continue
         enough = MIN_OVERLAPS["strict"][name]["bev"]
         own = detections.labels == label
         boxes, scores, left_out = detections.boxes[own], detections.scores[own], unscored[own]

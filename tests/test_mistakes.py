@@ -129,6 +129,12 @@ def test_worst_come_first() -> None:
     assert [len(each) for each in worst(mistakes, 20)] == [3, 3]
 
 
+def test_a_class_that_kitti_does_not_score_has_none() -> None:
+    frame = make_frame([("Van", car(10)), ("Car", car(30))], POINTS)
+    mistakes = find_mistakes(frame, detections(("Car", car(20), 0.9)), ("Van", *CLASSES[1:], "Car"), 0.5)
+    assert summary(mistakes) == [(MISS, "Car", 30, 0, 0, 1)]
+
+
 def test_labels_as_detections_are_no_mistakes(kitti_root: Path) -> None:
     """In real frames: none if all labels are detected, and as many as there are labels if nothing is."""
     for name in (kitti_root / "ImageSets" / "val.txt").read_text().split():
