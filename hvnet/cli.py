@@ -4,6 +4,7 @@ import argparse
 import sys
 import textwrap
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 
 class InputError(ValueError):
@@ -23,6 +24,24 @@ def make_parser(command: str, description: str, examples: Sequence[str]) -> argp
 def add_device(parser: argparse.ArgumentParser) -> None:
     """The option --device."""
     parser.add_argument("--device", default="auto", metavar="NAME", help="auto, cpu, cuda or cuda:1 (default: auto)")
+
+
+def add_checkpoint(parser: argparse.ArgumentParser) -> None:
+    """The option --checkpoint."""
+    parser.add_argument(
+        "--checkpoint", type=Path, metavar="FILE", help="of python -m hvnet.train (default: the weights of the package)"
+    )
+
+
+def add_changes(parser: argparse.ArgumentParser, what: str) -> None:
+    """The option --set, a list of changes; `what` is its help."""
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=what)
+
+
+def check_empty(out: Path, remedy: str = "give another --out") -> None:
+    """Raises InputError unless `out` is an empty folder or does not exist."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: is not empty; {remedy}")
 
 
 def run_command(main: Callable[[Sequence[str] | None], None]) -> None:

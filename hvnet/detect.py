@@ -4,6 +4,7 @@
 test set in its root (the readme of KITTI's object devkit), checked line by line before it is written.
 """
 
+import argparse
 import csv
 import math
 import zipfile
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from hvnet.cli import InputError, add_device, make_parser, run_command
+from hvnet.cli import InputError, add_checkpoint, add_device, check_empty, make_parser, run_command
 from hvnet.data.clouds import SUFFIXES, read_cloud
 from hvnet.data.kitti import (
     IMAGE_SIZE,
@@ -67,6 +68,16 @@ NO_IMAGE = Calibration(
     p2=np.eye(3, 4), r0_rect=np.eye(3), velo_to_cam=np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]])
 )
 """Camera axes at the LiDAR itself, for clouds that come without calibration."""
+
+
+def add_inputs(parser: argparse.ArgumentParser) -> None:
+    """The clouds that `find_sources` looks for: INPUT and the option --split."""
+    parser.add_argument(
+        "inputs", nargs="+", type=Path, metavar="INPUT", help=f"files ({', '.join(SUFFIXES)}), folders, KITTI roots"
+    )
+    parser.add_argument(
+        "--split", metavar="NAME", help="frames of ImageSets/NAME.txt of a KITTI root (default: all frames)"
+    )
 
 
 def find_sources(inputs: Sequence[Path], split: str | None) -> list[Source]:
@@ -265,15 +276,8 @@ def main(arguments: Sequence[str] | None) -> None:
             "/data/kitti --split test --checkpoint runs/hvnet/checkpoint.pt --out test",
         ],
     )
-    parser.add_argument(
-        "inputs", nargs="+", type=Path, metavar="INPUT", help=f"files ({', '.join(SUFFIXES)}), folders, KITTI roots"
-    )
-    parser.add_argument(
-        "--checkpoint", type=Path, metavar="FILE", help="of python -m hvnet.train (default: the weights of the package)"
-    )
-    parser.add_argument(
-        "--split", metavar="NAME", help="frames of ImageSets/NAME.txt of a KITTI root (default: all frames)"
-    )
+    add_inputs(parser)
+    add_checkpoint(parser)
     parser.add_argument(
         "--partial", action="store_true", help="with --split test: take the frames there are; no submission is written"
     )
@@ -288,8 +292,7 @@ def main(arguments: Sequence[str] | None) -> None:
     add_device(parser)
     options = parser.parse_args(arguments)
 
-    if options.out.exists() and (not options.out.is_dir() or any(options.out.iterdir())):
-        raise InputError(f"{options.out}: is not empty; give another --out")
+    check_empty(options.out)
     if options.partial and options.split != "test":
         raise InputError("--partial: is for --split test")
     submit = options.split == "test" and not options.partial

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from hvnet.anchors import ORIENTATIONS, level_step
-from hvnet.cli import InputError, make_parser, run_command
+from hvnet.cli import InputError, add_checkpoint, check_empty, make_parser, run_command
 from hvnet.config import ClassConfig, Config
 from hvnet.detector import SHIPPED, fold_batch_norms
 from hvnet.encoder import projection_grids
@@ -176,9 +176,7 @@ def main(arguments: Sequence[str] | None) -> None:
         "says how to run them.",
         ["", "--checkpoint runs/demo/checkpoint.pt --out deploy/demo", "--batch 4 --out deploy/four"],
     )
-    parser.add_argument(
-        "--checkpoint", type=Path, metavar="FILE", help="of python -m hvnet.train (default: the weights of the package)"
-    )
+    add_checkpoint(parser)
     parser.add_argument("--out", type=Path, default=Path("export"), metavar="DIR", help="(default: export)")
     parser.add_argument(
         "--batch",
@@ -192,8 +190,7 @@ def main(arguments: Sequence[str] | None) -> None:
         raise InputError(f"--batch {options.batch}: want 1 or more")
     if importlib.util.find_spec("onnx") is None:
         raise InputError("the package onnx is missing, without which torch writes no ONNX file: pip install onnx")
-    if options.out.exists() and (not options.out.is_dir() or any(options.out.iterdir())):
-        raise InputError(f"{options.out}: is not empty; give another --out")
+    check_empty(options.out)
 
     path = options.checkpoint or SHIPPED
     model = model_from_checkpoint(load_checkpoint(path), str(path))

@@ -11,9 +11,8 @@ from typing import get_args
 import torch
 from tqdm import tqdm
 
-from hvnet.cli import InputError, add_device, make_parser, run_command
-from hvnet.data.clouds import SUFFIXES
-from hvnet.detect import Source, camera_of, find_sources, read_source
+from hvnet.cli import InputError, add_checkpoint, add_device, check_empty, make_parser, run_command
+from hvnet.detect import Source, add_inputs, camera_of, find_sources, read_source
 from hvnet.detector import Detector, load
 from hvnet.draw import FORMATS, Colour, Features, Subject, draw_bev, draw_features, draw_frame
 
@@ -57,15 +56,8 @@ def main(arguments: Sequence[str] | None) -> None:
             "cloud.bin --features --checkpoint with.pt --compare without.pt",
         ],
     )
-    parser.add_argument(
-        "inputs", nargs="+", type=Path, metavar="INPUT", help=f"files ({', '.join(SUFFIXES)}), folders, KITTI roots"
-    )
-    parser.add_argument(
-        "--checkpoint", type=Path, metavar="FILE", help="of python -m hvnet.train (default: the weights of the package)"
-    )
-    parser.add_argument(
-        "--split", metavar="NAME", help="frames of ImageSets/NAME.txt of a KITTI root (default: all frames)"
-    )
+    add_inputs(parser)
+    add_checkpoint(parser)
     parser.add_argument("--features", action="store_true", help="draw pseudo-images, too, as NAME-features")
     parser.add_argument(
         "--compare", type=Path, metavar="FILE", help="a second checkpoint, whose pseudo-images stand beside"
@@ -76,8 +68,7 @@ def main(arguments: Sequence[str] | None) -> None:
     add_device(parser)
     options = parser.parse_args(arguments)
 
-    if options.out.exists() and (not options.out.is_dir() or any(options.out.iterdir())):
-        raise InputError(f"{options.out}: is not empty; give another --out")
+    check_empty(options.out)
     if options.compare and not options.features:
         raise InputError("--compare: is for --features; give both")
     sources = find_sources(options.inputs, options.split)

@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
-from hvnet.cli import InputError, add_device, make_parser, run_command
+from hvnet.cli import InputError, add_changes, add_device, make_parser, run_command
 from hvnet.config import Config, SyntheticConfig, config_to_dict, load_config
 from hvnet.data.kitti import Frame, Labels, detections_to_labels, read_frame, read_split
 from hvnet.detector import Detector, load
@@ -111,6 +111,7 @@ STUDIES = {
         (
             Row("corners", "corner loss", (88.90 + 69.76 + 77.13) / 3),
             Row("pose", "pose loss: x, y, l, w, theta", (87.67 + 68.37 + 73.34) / 3),
+            Row("pose-10", "pose loss at ten times the weight"),
             Row("iou-branch", "+ IoU branch"),
             Row("iou-loss", "IoU loss"),
             Row("giou-loss", "GIoU loss"),
@@ -161,25 +162,27 @@ class Outcome(NamedTuple):
         return mean_of([table["bev"][level] for table in self.scores.values()])
 
 
+def mean_of(values: Sequence[float | None]) -> float:
+    """The mean of the values that there are; NaN of none."""
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else math.nan
+
+
 def short_table(study: Study, outcomes: Sequence[Outcome], times: dict[str, Times]) -> list[str]:
     """What of a study fits a terminal: mAP, or the stages where nothing is trained, and the time."""
+    paper = any(row.paper is not None for row in study.rows)
     stages = [stage.replace(" and", ",") for stage in STAGES]
-    what = ["mAP, mean", "paper's", "ms a cloud"] if outcomes else [*stages, "ms a cloud", "2080 Ti, ms"]
+    what = ["mAP, mean", *["paper's"] * paper, "ms a cloud"] if outcomes else [*stages, "ms a cloud", "2080 Ti, ms"]
     wide = max(len(row.label) for row in study.rows)
     lines = [" " * wide + "".join(f"{title:>12}" for title in what)]
     for row in study.rows:
         if row.name in times:
             own = [outcome.mean_ap() for outcome in outcomes if outcome.row.name == row.name]
             whole = sum(times[row.name])
-            values = [mean_of(own), row.paper, whole] if outcomes else [*times[row.name], whole, row.paper]
+            trained = [mean_of(own), *[row.paper] * paper, whole]
+            values = trained if outcomes else [*times[row.name], whole, row.paper]
             lines.append(f"{row.label:<{wide}}" + "".join(f"{shown(value):>12}" for value in values))
     return lines
-
-
-def mean_of(values: Sequence[float | None]) -> float:
-    """The mean of the values that there are; NaN of none."""
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if known else math.nan
 
 
 def with_budget(config: Config, budget: str, frames: int) -> Config:
@@ -576,6 +579,63 @@ def agreement_legend(outcomes: Sequence[Outcome], seeds: int) -> str:
     )
 
 
+class Data(NamedTuple):
+    """What the rows of a study are trained, scored and timed on."""
+
+    name: str
+    root: Path
+    frames: list[list[str]]  # to train, to validate
+    clouds: list[Tensor]  # to time: the first to validate
+
+
+def read_data(name: str, config: Config, options: argparse.Namespace) -> Data:
+    """The KITTI root that was given, or generated scenes."""
+    if options.data is None and name == "speed" and config.synthetic is None:
+        config = replace(config, synthetic=SyntheticConfig(1, TIMED_CLOUDS))
+    if options.data is None and config.synthetic is None:
+        raise InputError(f"{options.base}: has no key synthetic, so the study needs --data with a KITTI root")
+    root = options.data or generated_scenes(config, options.out)
+    frames = [read_split(root, split) for split in (config.train.train_split, config.train.val_split)]
+    clouds = [read_frame(root, at).points for at in frames[1][:TIMED_CLOUDS]]
+    return Data(root.name if options.data else f"generated scenes, seed {config.train.seed}", root, frames, clouds)
+
+
+def time_rows(configs: dict[str, Config], data: Data, device: torch.device) -> tuple[dict[str, Times], list[str]]:
+    """The study of speed: the times of its rows, and the text."""
+    torch.manual_seed(0)
+    times = time_stages({row: Detector(HVNet(config).eval(), device) for row, config in configs.items()}, data.clouds)
+    legend = speed_legend(data.clouds, data.name, next(iter(configs.values())))
+    return times, [*speed_table(STUDIES["speed"], times, describe(device)), "", legend]
+
+
+def train_rows(
+    name: str, configs: dict[str, Config], data: Data, real: Sequence[str], options: argparse.Namespace
+) -> tuple[list[Outcome], dict[str, Times], list[str]]:
+    """Every other study: its rows, their times, and the text. The frames `real` are those of --validate."""
+    device, first = select_device(options.device), next(iter(configs.values()))
+    outcomes = run_rows(name, configs, data.root, data.frames, options)
+    detectors = {o.row.name: load(o.checkpoint, str(device)) for o in outcomes if o.seed == first.train.seed}
+    times = time_stages(detectors, data.clouds)
+    fused = {row for row, detector in detectors.items() if detector.encoder.is_fused(1)}
+    steps = " or ".join(map(str, sorted({outcome.steps for outcome in outcomes})))
+    trained_on = " and ".join(sorted({outcome.device for outcome in outcomes}))
+    lines = [
+        *trained_table(STUDIES[name], outcomes, times, fused),
+        "",
+        "mAP and the classes: exact AP in bird's eye view, moderate, in %, at an overlap of 0.7 (Car) and 0.5, of the "
+        f"objects in range. {data.name}: {len(data.frames[0])} frames to train, {len(data.frames[1])} to validate; "
+        f"{steps} steps of {first.train.batch_size} frames; trained on {trained_on}.",
+        "",
+        f"Time: of a cloud on {describe(device)}; the first row is 1." + UNFUSED * (fused < set(detectors)),
+    ]
+    if real:
+        cars = count_cars(first, options.validate, real)
+        lines += ["", f"Real: {len(real)} frames, which hold {cars} moderate cars in range."]
+    if options.seeds > 1 and len(times) > 1:
+        lines += ["", agreement_legend(outcomes, options.seeds)]
+    return outcomes, times, lines
+
+
 def run_study(name: str, options: argparse.Namespace) -> None:
     """Runs a study and writes its table, its CSV file and its picture."""
     study = STUDIES[name]
@@ -591,55 +651,24 @@ def run_study(name: str, options: argparse.Namespace) -> None:
     first = next(iter(configs.values()))
     check_classes(first, options.base or CONFIGS / "base.yaml")
     if options.budget:
-        with_budget(first, options.budget, 1)
+        with_budget(first, options.budget, 1)  # a mistake in it is said before the scenes are made
     device = select_device(options.device)
-    if options.data is None and name == "speed" and first.synthetic is None:
-        first = replace(first, synthetic=SyntheticConfig(1, TIMED_CLOUDS))
-    if options.data is None and first.synthetic is None:
-        raise InputError(f"{options.base}: has no key synthetic, so the study needs --data with a KITTI root")
-    root = options.data or generated_scenes(first, options.out)
-    splits = (first.train.train_split, first.train.val_split)
-    frames = [read_split(root, split) for split in splits]
-    real = read_split(options.validate, splits[1]) if options.validate else []
-    clouds = [read_frame(root, at).points for at in frames[1][:TIMED_CLOUDS]]
-    data = root.name if options.data else f"generated scenes, seed {first.train.seed}"
-    lines = [f"# {name}: {study.shows}", "", f"In the paper: {study.source}.", ""]
+    data = read_data(name, first, options)
+    real = read_split(options.validate, first.train.val_split) if options.validate else []
     outcomes: list[Outcome] = []
     if name == "speed":
-        torch.manual_seed(0)
-        wanted = options.rows or list(configs)
-        times = time_stages({row: Detector(HVNet(configs[row]).eval(), device) for row in wanted}, clouds)
-        lines += [*speed_table(study, times, describe(device)), "", speed_legend(clouds, data, first)]
+        times, lines = time_rows({row: configs[row] for row in options.rows or configs}, data, device)
         draw_speed(options.out / f"{name}.png", times, describe(device))
     else:
-        outcomes = run_rows(name, configs, root, frames, options)
-        detectors = {o.row.name: load(o.checkpoint, str(device)) for o in outcomes if o.seed == first.train.seed}
-        times = time_stages(detectors, clouds)
-        fused = {row for row, detector in detectors.items() if detector.encoder.is_fused(1)}
-        lines += trained_table(study, outcomes, times, fused)
-        steps = " or ".join(map(str, sorted({outcome.steps for outcome in outcomes})))
-        trained_on = " and ".join(sorted({outcome.device for outcome in outcomes}))
-        lines += [
-            "",
-            "mAP and the classes: exact AP in bird's eye view, moderate, in %, at an overlap of 0.7 (Car) and 0.5, of "
-            f"the objects in range. {data}: {len(frames[0])} frames to train, {len(frames[1])} to validate; {steps} "
-            f"steps of {first.train.batch_size} frames; trained on {trained_on}.",
-            "",
-            f"Time: of a cloud on {describe(device)}; the first row is 1." + UNFUSED * (fused < set(detectors)),
-        ]
-        if real:
-            cars = count_cars(first, options.validate, real)
-            lines += ["", f"Real: {len(real)} frames, which hold {cars} moderate cars in range."]
-        if options.seeds > 1 and len(times) > 1:
-            lines += ["", agreement_legend(outcomes, options.seeds)]
+        outcomes, times, lines = train_rows(name, configs, data, real, options)
         draw_trained(options.out / f"{name}.png", name, outcomes, times)
-    where: dict[str, object] = {"data": data, "train frames": len(frames[0]), "val frames": len(frames[1])}
-    where |= {"real frames": len(real), "timed on": describe(device)}
+    where: dict[str, object] = {"data": data.name, "train frames": len(data.frames[0])}
+    where |= {"val frames": len(data.frames[1]), "real frames": len(real), "timed on": describe(device)}
     write_csv(options.out / f"{name}.csv", name, outcomes, times, where)
-    (options.out / f"{name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print(
-        "\n" + "\n".join(textwrap.fill(line, 100) for line in short_table(study, outcomes, times) + lines[-1:]) + "\n"
-    )
+    text = [f"# {name}: {study.shows}", "", f"In the paper: {study.source}.", "", *lines]
+    (options.out / f"{name}.md").write_text("\n".join(text) + "\n", encoding="utf-8")
+    summary = [*short_table(study, outcomes, times), lines[-1]]
+    print("\n" + "\n".join(textwrap.fill(line, 100) for line in summary) + "\n")
     for suffix, title in (("md", "table"), ("csv", "rows"), ("png", "picture")):
         print(f"{title + ':':<9}{options.out / f'{name}.{suffix}'}")
 
@@ -675,9 +704,7 @@ def main(arguments: Sequence[str] | None) -> None:
     parser.add_argument(
         "--base", type=Path, metavar="FILE", help="config under the rows (default: configs/studies/base.yaml)"
     )
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="override a config value in every row"
-    )
+    add_changes(parser, "override a config value in every row")
     options = parser.parse_args(arguments)
 
     if options.list:

@@ -26,7 +26,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from hvnet import ranks
-from hvnet.cli import InputError, add_device, make_parser, run_command
+from hvnet.cli import InputError, add_changes, add_device, check_empty, make_parser, run_command
 from hvnet.config import Config, TrainConfig, config_to_dict, load_config
 from hvnet.data.augment import Objects, augment, mix_sectors, objects_of
 from hvnet.data.database import FILE_NAME, Database, build_database, read_database, write_database
@@ -611,8 +611,8 @@ def choose_out(given: str | None, config: Path, resume: bool) -> Path:
         out = names[max(free - 1, 0) if resume else free]
     if resume and not (out / "checkpoint.pt").is_file():
         raise InputError(f"{out}: holds no checkpoint.pt to resume; give the run's folder with --out, or no --resume")
-    if not resume and out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out}: is not empty; give another --out, or --resume to go on with the run in it")
+    if not resume:
+        check_empty(out, "give another --out, or --resume to go on with the run in it")
     return out
 
 
@@ -634,13 +634,7 @@ def main(arguments: Sequence[str] | None) -> None:
     parser.add_argument("--out", metavar="DIR", help="folder of the run (default: runs/NAME of the config)")
     parser.add_argument("--resume", action="store_true", help="go on with the run in --out (default: the latest)")
     add_device(parser)
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="override a config value, such as train.epochs=3",
-    )
+    add_changes(parser, "override a config value, such as train.epochs=3")
     options = parser.parse_args(arguments)
 
     config = load_config(options.config, options.set)

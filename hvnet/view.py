@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hvnet.boxes import box_corners
-from hvnet.cli import InputError, add_device, make_parser, run_command
+from hvnet.cli import InputError, add_checkpoint, add_device, make_parser, run_command
 from hvnet.data.clouds import SUFFIXES, read_cloud
 from hvnet.data.kitti import EDGES, Frame, read_frame, read_image
 from hvnet.data.synthetic import Options, generate
@@ -436,9 +436,7 @@ def main(arguments: Sequence[str] | None) -> None:
         metavar="INPUT",
         help=f"a file ({', '.join(SUFFIXES)}), a folder of them, a KITTI root, or a run of python -m hvnet.train",
     )
-    parser.add_argument(
-        "--checkpoint", type=Path, metavar="FILE", help="of python -m hvnet.train (default: the weights of the package)"
-    )
+    add_checkpoint(parser)
     parser.add_argument("--data", type=Path, metavar="DIR", help="for a run: a KITTI root (default: that of the run)")
     parser.add_argument("--split", metavar="NAME", help="frames of ImageSets/NAME.txt of a KITTI root (default: all)")
     parser.add_argument("--port", type=int, default=8080, metavar="N", help="or the next that is free (default: 8080)")

@@ -6,15 +6,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from hvnet.config import config_to_dict, load_config
+from hvnet.config import Config, config_to_dict, load_config
 from hvnet.data.synthetic import Options, generate
 from hvnet.model import HVNet, save_checkpoint
+from tests.models import CONFIGS, NARROW
 
 torch.utils.deterministic.fill_uninitialized_memory = True
 torch.use_deterministic_algorithms(True)  # with it, torch.empty is filled with NaN or the largest integer
 torch.set_num_threads(1)  # the networks here are small: threads cost more than they save where others use the cores
 
-ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("HVNET_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 
 
@@ -42,12 +42,18 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def demo() -> Config:
+    """The demo's config over a narrow range."""
+    return load_config(CONFIGS / "demo.yaml", NARROW)
+
+
+@pytest.fixture(scope="session")
 def pillars(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A checkpoint of an untrained model with PointPillars' encoder, which has one grid and no scales."""
     torch.manual_seed(0)
     narrow = ["backbone.widths=[8, 8, 8]", "backbone.layers=[2, 2, 2]", "backbone.fusion_channels=8"]
     narrow += ["encoder.image_channels=8", "encoder.point_limit=8"]
-    config = load_config(ROOT / "configs" / "studies" / "voxel-size" / "pillars-0.16.yaml", narrow)
+    config = load_config(CONFIGS / "studies" / "voxel-size" / "pillars-0.16.yaml", narrow)
     path = tmp_path_factory.mktemp("pillars") / "checkpoint.pt"
     save_checkpoint(path, {"config": config_to_dict(config), "model": HVNet(config).state_dict()})
     return path

@@ -21,8 +21,8 @@ from hvnet.config import (
     config_to_dict,
     load_config,
 )
+from tests.models import CONFIGS
 
-CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 SHIPPED = sorted(CONFIGS.glob("*.yaml"))
 
 

@@ -20,7 +20,7 @@ from pypcd4 import Encoding, PointCloud
 from hvnet import evaluate
 from hvnet.boxes import limit_angle
 from hvnet.cli import InputError
-from hvnet.config import config_to_dict, load_config
+from hvnet.config import config_to_dict
 from hvnet.data.kitti import (
     Calibration,
     boxes_to_lidar,
@@ -32,32 +32,17 @@ from hvnet.data.kitti import (
 )
 from hvnet.detect import NO_IMAGE, Cloud, check_results, csv_rows, main, result_rows, submission_rows
 from hvnet.detector import load
-from hvnet.model import Detections, HVNet, load_checkpoint, save_checkpoint
+from hvnet.model import Detections, load_checkpoint, save_checkpoint
+from tests.models import TINY, save_untrained
 
 ROOT = Path(__file__).resolve().parents[1]
-TINY = [
-    "encoder.point_range=[0, -6.4, -3, 25.6, 6.4, 2]",
-    "encoder.feature_channels=4",
-    "encoder.image_channels=8",
-    "backbone.widths=[8, 8, 8]",
-    "backbone.layers=[2, 2, 2]",
-    "backbone.fusion_channels=8",
-    "head.score_threshold=0.0",
-    "head.candidates=100",
-    "head.detections=8",
-]
 
 
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An untrained detector that reports its 8 best boxes a class, whatever it sees."""
-    torch.manual_seed(0)
-    config = load_config(ROOT / "configs" / "demo.yaml", TINY)
-    model = HVNet(config)
-    for head in model.heads:
-        torch.nn.init.normal_(head.score.weight, std=0.05)
     path = tmp_path_factory.mktemp("model") / "checkpoint.pt"
-    save_checkpoint(path, {"config": config_to_dict(config), "model": model.state_dict()})
+    save_untrained(path, [*TINY, "head.score_threshold=0.0", "head.candidates=100", "head.detections=8"])
     return path
 
 

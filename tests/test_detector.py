@@ -15,38 +15,9 @@ from hvnet.detector import Detector, fold_batch_norms, load, regress, regression
 from hvnet.head import Head
 from hvnet.kernels.rotated import rotated_iou_bev
 from hvnet.model import Detections, HVNet, save_checkpoint
+from tests.models import CONFIGS, NARROW, lively, some_points
 
-CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 CPU = torch.device("cpu")
-# not square: 32 x 16 cells of 0.4 m at the finest scale
-NARROW = ["encoder.point_range=[0, -3.2, -3, 12.8, 3.2, 2]"]
-
-
-@pytest.fixture(scope="module")
-def demo() -> Config:
-    return load_config(CONFIGS / "demo.yaml", NARROW)
-
-
-def some_points(count: int = 500, seed: int = 0) -> Tensor:
-    low, high = torch.tensor([0.0, -3.2, -3.0, 0.0]), torch.tensor([12.8, 3.2, 2.0, 1.0])
-    return low + torch.rand(count, 4, generator=torch.Generator().manual_seed(seed)) * (high - low)
-
-
-def lively(config: Config, seed: int = 0, **head: object) -> HVNet:
-    """A model whose scores differ from anchor to anchor, and whose batch norms do something."""
-    torch.manual_seed(seed)
-    model = HVNet(dataclasses.replace(config, head=dataclasses.replace(config.head, **head)))
-    for each in model.heads:
-        for branch in (each.score, each.location, each.vertical):
-            torch.nn.init.normal_(branch.weight, std=0.05)
-    for module in model.modules():
-        if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
-            torch.nn.init.uniform_(module.weight, 0.5, 1.5)
-            torch.nn.init.uniform_(module.bias, -0.5, 0.5)
-            module.momentum = 1.0
-    with torch.no_grad():
-        model(some_points(), torch.arange(500) % 2, 2)
-    return model.eval()
 
 
 def same(found: Detections, want: Detections, tolerance: float = 1e-4) -> None:

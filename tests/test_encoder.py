@@ -195,14 +195,7 @@ def test_projection_grids_are_padded_and_halved() -> None:
 def trained(config: EncoderConfig) -> HybridVoxelEncoder:
     """An encoder whose statistics and weights are not those of the start, in evaluation mode."""
     torch.manual_seed(5)
-    encoder = HybridVoxelEncoder(config)
-    for module in encoder.modules():
-        if isinstance(module, torch.nn.BatchNorm1d):
-            module.running_mean.normal_()
-            module.running_var.uniform_(0.5, 2)
-            torch.nn.init.normal_(module.weight)
-            torch.nn.init.normal_(module.bias)
-    return encoder.eval()
+    return restless(HybridVoxelEncoder(config)).eval()
 
 
 @pytest.mark.parametrize(("feature_scales", "projection_scales"), SCALES)

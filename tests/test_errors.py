@@ -15,25 +15,13 @@ import torch
 from PIL import Image
 
 from hvnet.cli import InputError
-from hvnet.config import config_to_dict, load_config
 from hvnet.data.kitti import read_frame, read_split
 from hvnet.detector import load
 from hvnet.errors import describe, main
 from hvnet.mistakes import FALSE_POSITIVE, MISS, Mistake, find_mistakes, worst
-from hvnet.model import HVNet, save_checkpoint
+from tests.models import TINY, save_untrained
 
 ROOT = Path(__file__).resolve().parents[1]
-TINY = [
-    "encoder.point_range=[0, -12.8, -3, 25.6, 12.8, 2]",
-    "encoder.feature_channels=4",
-    "encoder.image_channels=8",
-    "backbone.widths=[8, 8, 8]",
-    "backbone.layers=[2, 2, 2]",
-    "backbone.fusion_channels=8",
-    "head.score_threshold=0.0",
-    "head.candidates=100",
-    "head.detections=6",
-]
 AVERAGES = {"R40": {"bev": [1.0, 2.0, 3.0], "3d": [0.0, 1.0, 2.0]}, "exact": {"bev": [1.0, 2.0, 3.0]}}
 METRICS = [
     {"epoch": 1, "step": 2, "loss": 2.0, "classification": 1.5, "localization": 0.5},
@@ -45,14 +33,10 @@ METRICS = [
 @pytest.fixture(scope="module")
 def run(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of an untrained detector in a folder whose name has to be escaped in HTML."""
-    torch.manual_seed(0)
-    config = load_config(ROOT / "configs" / "demo.yaml", TINY)
-    model = HVNet(config)
-    for head in model.heads:
-        torch.nn.init.normal_(head.score.weight, std=0.05)
     out = tmp_path_factory.mktemp("runs") / "a <b> & c"
     out.mkdir()
-    save_checkpoint(out / "checkpoint.pt", {"config": config_to_dict(config), "model": model.state_dict()})
+    wide = ["encoder.point_range=[0, -12.8, -3, 25.6, 12.8, 2]", "head.score_threshold=0.0"]
+    save_untrained(out / "checkpoint.pt", [*TINY, *wide, "head.candidates=100", "head.detections=6"])
     (out / "metrics.jsonl").write_text("".join(json.dumps(record) + "\n" for record in METRICS))
     (out / "data.txt").write_text(f"{scenes}\n")
     return out
@@ -125,6 +109,21 @@ def test_a_page_of_pillars(pillars: Path, scenes: Path, tmp_path: Path) -> None:
     page = Page(out.read_text(encoding="utf-8"))
     assert len(page.images("crop")) == 2
     assert "0 false positives" in page.text
+
+
+def test_a_class_that_kitti_does_not_score_is_left_out(scenes: Path, tmp_path: Path) -> None:
+    van = ["augment.objects={}", "head.classes.Cyclist.name=Van"]
+    few = ["head.score_threshold=0.0", "head.candidates=50", "head.detections=5"]
+    save_untrained(tmp_path / "model.pt", [*TINY, *few, *van])
+    given = [str(tmp_path / "model.pt"), "--data", str(scenes), "--min-score", "0", "--device", "cpu"]
+    main([*given, "--out", str(tmp_path / "page.html")])
+    page = (tmp_path / "page.html").read_text()
+    assert "Pedestrian" in page
+    assert "Cyclist" not in page
+    others = ["head.classes.Car.name=Truck", "head.classes.Pedestrian.name=Person_sitting"]
+    save_untrained(tmp_path / "vans.pt", [*TINY, *van, *others])
+    with pytest.raises(InputError, match=r"vans\.pt: finds none of Car, Pedestrian, Cyclist"):
+        main([str(tmp_path / "vans.pt"), "--data", str(scenes), "--out", str(tmp_path / "other.html")])
 
 
 def test_nothing_comes_from_elsewhere(run: Path) -> None:

@@ -1,6 +1,5 @@
 """Export: the ONNX file and the program of torch.export against torch, and docs/deploy.md as it stands."""
 
-import dataclasses
 import importlib.util
 import json
 import re
@@ -23,37 +22,11 @@ from hvnet.detector import SHIPPED
 from hvnet.export import describe, main, map_names, maps_of_class, write_onnx, write_program
 from hvnet.head import HeadMaps
 from hvnet.model import Detections, HVNet, load_checkpoint, model_from_checkpoint, save_checkpoint
+from tests.models import NARROW, lively, some_clouds
 
 ROOT = Path(__file__).resolve().parents[1]
 DEMO = ROOT / "configs" / "demo.yaml"
-NARROW = "encoder.point_range=[0, -3.2, -3, 12.8, 3.2, 2]"  # not square: 32 x 16 cells at the finest scale
-
-
-def lively(*changes: str) -> HVNet:
-    """A small model whose maps differ from anchor to anchor, and whose batch norms do something."""
-    torch.manual_seed(0)
-    config = load_config(DEMO, [NARROW, *changes])
-    model = HVNet(dataclasses.replace(config, head=dataclasses.replace(config.head, score_threshold=0.02)))
-    for head in model.heads:
-        for branch in (head.score, head.location, head.vertical):
-            torch.nn.init.normal_(branch.weight, std=0.05)
-    for module in model.modules():
-        if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
-            torch.nn.init.uniform_(module.weight, 0.5, 1.5)
-            torch.nn.init.uniform_(module.bias, -0.5, 0.5)
-            module.momentum = 1.0
-    with torch.no_grad():
-        model(*clouds(model, 2), 2)
-    return model.eval()
-
-
-def clouds(model: HVNet, count: int, points: int = 500) -> tuple[Tensor, Tensor]:
-    """Random points of as many clouds in the model's range, and the clouds they belong to."""
-    low, high = torch.tensor(model.config.encoder.point_range).view(2, 3)
-    generator = torch.Generator().manual_seed(count)
-    where = low + torch.rand(count * points, 3, generator=generator) * (high - low)
-    reflectance = torch.rand(count * points, 1, generator=generator)
-    return torch.cat((where, reflectance), dim=1), torch.arange(count).repeat_interleave(points)
+SMALL = [*NARROW, "head.score_threshold=0.02"]
 
 
 def scene(root: Path, count: int) -> tuple[Tensor, Tensor]:
@@ -129,8 +102,8 @@ def test_onnx_gives_the_maps_and_boxes_of_torch(
 ) -> None:
     """The shipped weights on generated scenes, the demo's network on noise; one file serves any batch."""
     pytest.importorskip("onnx", reason="onnx is not installed: pip install '.[test]'")
-    model = shipped if name == "compact" else lively()
-    points, sample = scene(scenes, batch) if name == "compact" else clouds(model, batch)
+    model = shipped if name == "compact" else lively(load_config(DEMO, SMALL))
+    points, sample = scene(scenes, batch) if name == "compact" else some_clouds(batch)
     write_onnx(model, tmp_path / "part.onnx")
     with torch.no_grad():
         images = model.encoder(points, sample, batch)
@@ -156,10 +129,10 @@ def test_onnx_gives_the_maps_and_boxes_of_torch(
 )
 def test_onnx_of_every_switch(changes: tuple[str, ...], tmp_path: Path) -> None:
     pytest.importorskip("onnx", reason="onnx is not installed: pip install '.[test]'")
-    model = lively(*changes)
+    model = lively(load_config(DEMO, [*SMALL, *changes]))
     write_onnx(model, tmp_path / "part.onnx")
     with torch.no_grad():
-        images = model.encoder(*clouds(model, 2), 2)
+        images = model.encoder(*some_clouds(2), 2)
         want = by_name(model, model.maps_of(images))
     assert_same_maps(maps_of_onnx(tmp_path / "part.onnx", images), want)
 
@@ -224,11 +197,11 @@ def test_the_program_wants_two_points(exported: Path) -> None:
 
 
 def test_a_program_for_two_clouds_and_scales_that_do_not_nest(tmp_path: Path) -> None:
-    model = lively("encoder.feature_scales=[0.5, 0.75, 2]", "encoder.vfe=plain")
+    model = lively(load_config(DEMO, [*SMALL, "encoder.feature_scales=[0.5, 0.75, 2]", "encoder.vfe=plain"]))
     write_program(model, tmp_path / "detector.pt2", 2)
     assert all(weight.requires_grad for weight in model.parameters())
     program = torch.export.load(tmp_path / "detector.pt2").module()
-    points, sample = clouds(model, 2, 650)
+    points, sample = some_clouds(2, 650)
     with torch.no_grad():
         want = by_name(model, model(points, sample, 2))
     assert_same_maps(program(points, sample), want)
@@ -236,7 +209,7 @@ def test_a_program_for_two_clouds_and_scales_that_do_not_nest(tmp_path: Path) ->
 
 def test_a_config_that_drops_points_has_no_program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("onnx", reason="onnx is not installed: pip install '.[test]'")
-    model = lively("encoder.point_limit=1")
+    model = lively(load_config(DEMO, [*SMALL, "encoder.point_limit=1"]))
     content = {"config": config_to_dict(model.config), "model": model.state_dict()}
     save_checkpoint(tmp_path / "checkpoint.pt", content)
     main(["--checkpoint", str(tmp_path / "checkpoint.pt"), "--out", str(tmp_path / "out")])

@@ -11,21 +11,13 @@ import torch
 from PIL import Image
 
 from hvnet.cli import InputError
-from hvnet.config import config_to_dict, load_config
 from hvnet.data.kitti import read_frame
 from hvnet.detector import Detector, load
 from hvnet.figures import features_of, main
-from hvnet.model import HVNet, load_checkpoint, model_from_checkpoint, save_checkpoint
+from hvnet.model import load_checkpoint, model_from_checkpoint
+from tests.models import TINY, save_untrained
 
 ROOT = Path(__file__).resolve().parents[1]
-TINY = [
-    "encoder.point_range=[0, -6.4, -3, 25.6, 6.4, 2]",
-    "encoder.feature_channels=4",
-    "encoder.image_channels=8",
-    "backbone.widths=[8, 8, 8]",
-    "backbone.layers=[2, 2, 2]",
-    "backbone.fusion_channels=8",
-]
 
 
 @pytest.fixture(scope="module")
@@ -33,10 +25,8 @@ def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Two untrained models of one name in two folders."""
     paths = []
     for k, options in enumerate((TINY, [*TINY, "encoder.attention_relu=true"])):
-        torch.manual_seed(k)
-        config = load_config(ROOT / "configs" / "demo.yaml", options)
         paths.append(tmp_path_factory.mktemp("run") / "checkpoint.pt")
-        save_checkpoint(paths[-1], {"config": config_to_dict(config), "model": HVNet(config).state_dict()})
+        save_untrained(paths[-1], options, seed=k)
     return paths
 
 

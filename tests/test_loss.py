@@ -13,7 +13,7 @@ from hvnet.head import HeadMaps
 from hvnet.kernels.rotated import rotated_iou_bev
 from hvnet.loss import class_loss, iou_pairs
 from hvnet.model import HVNet
-from tests.test_config import CONFIGS
+from tests.models import CONFIGS
 
 
 def box(x: float, y: float, l: float, w: float, yaw: float = 0.0) -> Tensor:

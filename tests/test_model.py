@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import math
-from pathlib import Path
 
 import pytest
 import torch
@@ -17,20 +16,7 @@ from hvnet.head import HeadMaps, anchor_rows
 from hvnet.kernels import reference
 from hvnet.loss import class_loss, focal_loss
 from hvnet.model import Detections, HVNet
-
-CONFIGS = Path(__file__).resolve().parents[1] / "configs"
-# not square: 32 x 16 cells of 0.4 m at the finest scale
-NARROW = ["encoder.point_range=[0, -3.2, -3, 12.8, 3.2, 2]"]
-
-
-@pytest.fixture(scope="module")
-def demo() -> Config:
-    return load_config(CONFIGS / "demo.yaml", NARROW)
-
-
-def some_points(count: int = 500, seed: int = 0) -> Tensor:
-    low, high = torch.tensor([0.0, -3.2, -3.0, 0.0]), torch.tensor([12.8, 3.2, 2.0, 1.0])
-    return low + torch.rand(count, 4, generator=torch.Generator().manual_seed(seed)) * (high - low)
+from tests.models import CONFIGS, some_points
 
 
 def random_boxes(count: int, seed: int = 0) -> Tensor:

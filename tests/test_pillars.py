@@ -12,7 +12,7 @@ from hvnet.kernels import reference
 from hvnet.kernels.voxel import is_nested, make_grid
 from hvnet.model import HVNet
 from hvnet.pillars import PillarEncoder, hard_voxels
-from tests.test_config import CONFIGS
+from tests.models import CONFIGS
 
 RANGE = (0.0, -2.0, -3.0, 4.0, 2.0, 2.0)
 # in 1 m voxels, by cursor: 5, 5, 0, 5, outside, 0, 10

@@ -43,16 +43,12 @@ from hvnet.train import (
     main,
     seeded,
 )
+from tests.models import TINY
 
 CPU = torch.device("cpu")
 DEMO = Path(__file__).resolve().parents[1] / "configs" / "demo.yaml"
-TINY = [
-    "encoder.point_range=[0, -6.4, -3, 25.6, 6.4, 2]",
-    "encoder.feature_channels=4",
-    "encoder.image_channels=8",
-    "backbone.widths=[8, 8, 8]",
-    "backbone.layers=[2, 2, 2]",
-    "backbone.fusion_channels=8",
+SHORT = [
+    *TINY,
     "head.score_threshold=0.001",
     "head.candidates=50",
     "head.detections=5",
@@ -81,7 +77,7 @@ def run(root: Path | None, out: Path, *changes: str, resume: bool = False, confi
     arguments += ["--resume"] if resume else []
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
-        main(arguments + [part for change in (*TINY, *changes) for part in ("--set", change)])
+        main(arguments + [part for change in (*SHORT, *changes) for part in ("--set", change)])
     return printed.getvalue()
 
 
@@ -126,7 +122,7 @@ def copied(scenes: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def tiny() -> Config:
-    return load_config(DEMO, TINY)
+    return load_config(DEMO, SHORT)
 
 
 # --- a run ------------------------------------------------------------------------------------------------------------
@@ -356,7 +352,7 @@ def test_two_ranks_train_and_one_goes_on(scenes: Path, trained: tuple[Path, str]
     """torchrun: the losses are those of one process but for rounding, and all frames are validated."""
     out = tmp_path / "out"
     arguments = ["--config", str(DEMO), "--out", str(out), "--device", "cpu", "--data", str(scenes)]
-    arguments += [part for change in (*TINY, "train.epochs=1") for part in ("--set", change)]
+    arguments += [part for change in (*SHORT, "train.epochs=1") for part in ("--set", change)]
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     done = subprocess.run(
         [*command, "-m", "hvnet.train", *arguments], cwd=DEMO.parents[1], capture_output=True, text=True, check=False
@@ -409,7 +405,7 @@ def test_a_killed_run_goes_on(
     """kill -9 in a step, and in the middle of a checkpoint: the resumed run ends with the same bits."""
     out = tmp_path / "out"
     arguments = ["--config", str(DEMO), "--out", str(out), "--device", "cpu", "--data", str(scenes)]
-    arguments += [part for change in TINY for part in ("--set", change)]
+    arguments += [part for change in SHORT for part in ("--set", change)]
     command = [sys.executable, "-c", KILLED, place, str(count), *arguments]
     done = subprocess.run(command, cwd=DEMO.parents[1], capture_output=True, text=True, check=False)
     assert done.returncode == -signal.SIGKILL, done.stderr
