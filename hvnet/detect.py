@@ -21,11 +21,13 @@ from tqdm import tqdm
 from hvnet.cli import InputError, add_checkpoint, add_device, check_empty, make_parser, run_command
 from hvnet.data.clouds import SUFFIXES, read_cloud
 from hvnet.data.kitti import (
+    AT_LIDAR,
     IMAGE_SIZE,
+    NO_IMAGE,
     Calibration,
     Labels,
-    boxes_to_camera,
     detections_to_labels,
+    has_camera,
     read_frame,
     read_image,
     read_labels,
@@ -59,15 +61,9 @@ class Cloud(NamedTuple):
 
     points: Tensor  # (N, 4)
     truth: Tensor  # (T, 7), none where there are no labels
-    calib: Calibration | None
-    image_size: tuple[int, int]
+    calib: Calibration
+    image_size: tuple[int, int]  # NO_IMAGE without a camera
     notes: list[str]
-
-
-NO_IMAGE = Calibration(
-    p2=np.eye(3, 4), r0_rect=np.eye(3), velo_to_cam=np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]])
-)
-"""Camera axes at the LiDAR itself, for clouds that come without calibration."""
 
 
 def add_inputs(parser: argparse.ArgumentParser) -> None:
@@ -118,7 +114,7 @@ def _kitti_sources(root: Path, split: str | None) -> list[Source]:
         raise InputError(f"{root / folder / 'velodyne'}: holds no .bin file")
     sources = [Source(name, root, folder) for name in names]
     for source in sources:
-        if source.kitti_file("calib", ".txt") is None:
+        if has_camera(root / folder) and source.kitti_file("calib", ".txt") is None:
             raise InputError(f"{root / folder / 'calib' / source.name}.txt: no such file; each frame wants one")
     return sources
 
@@ -139,7 +135,7 @@ def read_source(source: Source, classes: Sequence[str]) -> Cloud:
     """Reads a source; a KITTI frame comes with its calibration and, where there are labels, the true boxes."""
     if source.split_dir is None:
         points, notes = read_cloud(source.path)
-        return Cloud(torch.from_numpy(points), torch.zeros(0, 7), None, (0, 0), notes)
+        return Cloud(torch.from_numpy(points), torch.zeros(0, 7), AT_LIDAR, NO_IMAGE, notes)
     labelled = source.kitti_file("label_2", ".txt") is not None
     frame = read_frame(source.path, source.name, source.split_dir, labelled=labelled)
     truth = frame.boxes[[name in classes for name in frame.names]]
@@ -147,36 +143,24 @@ def read_source(source: Source, classes: Sequence[str]) -> Cloud:
 
 
 def camera_of(source: Source, cloud: Cloud) -> Camera | None:
-    """The camera of a KITTI frame with its image, where there is one; None for other clouds."""
-    if cloud.calib is None:
+    """The camera of a KITTI frame with its image, where there is one; None for clouds without a camera."""
+    if cloud.image_size == NO_IMAGE:
         return None
     path = source.kitti_file("image_2", ".png")
     return Camera(cloud.calib, cloud.image_size, None if path is None else read_image(path))
 
 
 def result_rows(found: Detections, cloud: Cloud, classes: Sequence[str]) -> Labels:
-    """The rows of a KITTI result file. Without calibration the 2D boxes are -1 and the camera stands at the LiDAR.
+    """The rows of a KITTI result file. Without a camera the 2D boxes are -1, and the axes those of AT_LIDAR.
 
     Of a box with less than 0.01 pixels in the image nothing is reported: rounded it would have no area.
     """
     names = [classes[label] for label in found.labels.tolist()]
-    if cloud.calib is not None:
-        rows = detections_to_labels(found.boxes, found.scores, names, cloud.calib, cloud.image_size)
-        size = rows.bbox[:, 2:] - rows.bbox[:, :2]
-        return rows.select(size.min(axis=1) >= 0.01)
-    dimensions, location, rotation_y = boxes_to_camera(found.boxes.double().cpu().numpy(), NO_IMAGE)
-    alpha = rotation_y - np.arctan2(location[:, 0], location[:, 2])
-    return Labels(
-        name=np.array(names, dtype=np.str_),
-        truncation=np.full(len(names), -1.0),
-        occlusion=np.full(len(names), -1),
-        alpha=(alpha + np.pi) % (2 * np.pi) - np.pi,
-        bbox=np.full((len(names), 4), -1.0),
-        dimensions=dimensions,
-        location=location,
-        rotation_y=rotation_y,
-        score=found.scores.double().cpu().numpy(),
-    )
+    rows = detections_to_labels(found.boxes, found.scores, names, cloud.calib, cloud.image_size)
+    if cloud.image_size == NO_IMAGE:
+        return rows
+    size = rows.bbox[:, 2:] - rows.bbox[:, :2]
+    return rows.select(size.min(axis=1) >= 0.01)
 
 
 def csv_rows(name: str, found: Detections, classes: Sequence[str]) -> Iterator[list[object]]:
@@ -299,6 +283,8 @@ def main(arguments: Sequence[str] | None) -> None:
     sources = find_sources(options.inputs, options.split)
     if submit:
         check_test_set([source.name for source in sources])
+        if not all(has_camera(source.path / "testing") for source in sources):
+            raise InputError("--split test: there is no testing/calib, and the KITTI server wants 2D boxes; add it")
         blind = sum(source.kitti_file("image_2", ".png") is None for source in sources)
         if blind:
             width, height = IMAGE_SIZE
@@ -307,7 +293,7 @@ def main(arguments: Sequence[str] | None) -> None:
     total = detect(detector, sources, options.out, options.pictures, submit)
     if scores := score_results(sources, options.out / "results", detector.classes):
         print(scores + "\n")
-    print(f"{total} boxes in {len(sources)} clouds")
+    print(f"{total} boxes in {len(sources)} cloud{'s' * (len(sources) != 1)}")
     print(f"results:    {options.out / 'results'}\nboxes:      {options.out / 'boxes.csv'}")
     if options.pictures > 0:
         print(f"pictures:   {options.out / 'pictures'}")

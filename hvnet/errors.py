@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import matplotlib
 import numpy as np
 from jinja2 import Environment
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
@@ -26,7 +27,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from hvnet.cli import InputError, add_device, make_parser, run_command
-from hvnet.data.kitti import detections_to_labels, project_boxes, read_frame, read_image, read_split
+from hvnet.data.kitti import NO_IMAGE, detections_to_labels, project_boxes, read_frame, read_image, read_split
 from hvnet.detector import Detector, load
 from hvnet.draw import CLASS_COLOURS, TRUTH_COLOUR, Camera, Subject, show_bev, show_camera
 from hvnet.evaluate import CLASSES, MIN_OVERLAPS, evaluate, format_table
@@ -36,6 +37,13 @@ from hvnet.model import Detections
 
 REACH = 8.0
 """Metres that a crop from above shows to every side of the box."""
+DASHED: dict[str, Any] = {
+    "fill": False,
+    "edgecolor": "#111111",
+    "linestyle": "--",
+    "path_effects": [withStroke(linewidth=2.5, foreground="white")],
+}
+"""The line around the box in question."""
 
 PAGE = """<!DOCTYPE html>
 <html lang="en">
@@ -150,7 +158,7 @@ def _read_metrics(path: Path) -> list[dict[str, Any]]:
 def draw_curves(metrics: Sequence[dict[str, Any]]) -> bytes:
     """Losses and validation AP (exact, moderate, BEV and 3D) by epoch, as SVG."""
     figure = Figure(figsize=(10.5, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    left, right = figure.subplots(1, 2, sharex=True)
     epochs = [record["epoch"] for record in metrics]
     for name in (name for name in metrics[0] if name not in ("epoch", "step", "validation")):
         width = 2.0 if name == "loss" else 1.0
@@ -176,33 +184,39 @@ def draw_curves(metrics: Sequence[dict[str, Any]]) -> bytes:
     return file.getvalue()
 
 
-def draw_crop(mistake: Mistake, subject: Subject, camera: Camera) -> bytes:
-    """The neighbourhood of a mistake in the camera's image and from above, the box inside a dashed line, as PNG."""
-    figure = Figure(figsize=(7.6, 2.7), dpi=120)
+def draw_crop(mistake: Mistake, subject: Subject, camera: Camera | None) -> bytes:
+    """The neighbourhood of a mistake from above, the box inside a dashed line, as PNG; left of it in the image."""
+    wide = 2.8 if camera is None else 7.6
+    figure = Figure(figsize=(wide, 2.7), dpi=120)
     # places in parts of the figure: 4.8 by 2.4 inches and 2.4 by 2.4; a layout that is found takes half as long again
-    left, right = figure.add_axes((0.007, 0.093, 0.632, 0.889)), figure.add_axes((0.678, 0.093, 0.316, 0.889))
-    show_camera(left, subject, camera)
-    show_bev(right, subject, _around(mistake))
-    right.set(xlabel="", ylabel="")
-    right.tick_params(labelsize=7)
-    halo = [withStroke(linewidth=2.5, foreground="white")]
-    dashed: dict[str, Any] = {"fill": False, "edgecolor": "#111111", "linestyle": "--", "path_effects": halo}
+    above = figure.add_axes((1 - 2.45 / wide, 0.093, 2.4 / wide, 0.889))
+    show_bev(above, subject, _around(mistake))
+    above.set(xlabel="", ylabel="")
+    above.tick_params(labelsize=7)
     x, y, _, length, width, *_ = mistake.box.tolist()
-    right.add_patch(Circle((-y, x), math.hypot(length, width) / 2 + 0.4, **dashed))
-    bbox, visible = project_boxes(mistake.box[None].numpy(), camera.calib, camera.size)
-    if visible[0]:
-        x, y, width, height = _window(bbox[0], camera.size)
-        left.set_xlim(x, x + width)
-        left.set_ylim(y + height, y)
-        margin = 0.03 * height
-        wide, high = bbox[0, 2:] - bbox[0, :2] + 2 * margin
-        left.add_patch(Rectangle(tuple(bbox[0, :2] - margin), wide, high, **dashed))
+    above.add_patch(Circle((-y, x), math.hypot(length, width) / 2 + 0.4, **DASHED))
+    if camera is not None:
+        axes = figure.add_axes((0.05 / wide, 0.093, 4.8 / wide, 0.889))
+        show_camera(axes, subject, camera)
+        bbox, visible = project_boxes(mistake.box[None].numpy(), camera.calib, camera.size)
+        if visible[0]:
+            _zoom_in(axes, bbox[0], camera.size)
     canvas, file = FigureCanvasAgg(figure), io.BytesIO()
     canvas.draw()
     # a palette takes a third of the bytes, and a page holds many crops; an octree's keeps the colours of thin lines
     whole = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     whole.quantize(256, Image.Quantize.FASTOCTREE).save(file, format="PNG")
     return file.getvalue()
+
+
+def _zoom_in(axes: Axes, bbox: NDArray[np.float64], size: tuple[int, int]) -> None:
+    """Shows the neighbourhood of a 2D box (4,) of an image, the box inside a dashed line."""
+    x, y, width, height = _window(bbox, size)
+    axes.set_xlim(x, x + width)
+    axes.set_ylim(y + height, y)
+    margin = 0.03 * height
+    wide, high = bbox[2:] - bbox[:2] + 2 * margin
+    axes.add_patch(Rectangle(tuple(bbox[:2] - margin), wide, high, **DASHED))
 
 
 def _around(mistake: Mistake) -> tuple[float, ...]:
@@ -240,7 +254,8 @@ def make_crop(mistake: Mistake, detector: Detector, root: Path, found: Detection
     """Reads the mistake's frame again and draws it."""
     frame = read_frame(root, mistake.frame)
     path = root / "training" / "image_2" / f"{mistake.frame}.png"
-    camera = Camera(frame.calib, frame.image_size, read_image(path) if path.is_file() else None)
+    image = read_image(path) if path.is_file() else None
+    camera = None if frame.image_size == NO_IMAGE else Camera(frame.calib, frame.image_size, image)
     own = found.labels == detector.classes.index(mistake.name)
     shown = (found.scores >= min_score) | (own & (rotated_iou_bev(mistake.box[None], found.boxes)[0] > 0))
     found = Detections(found.boxes[shown], found.scores[shown], found.labels[shown])

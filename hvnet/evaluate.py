@@ -21,10 +21,12 @@ from tqdm import tqdm
 from hvnet.boxes import points_in_boxes
 from hvnet.cli import InputError, make_parser, run_command
 from hvnet.data.kitti import (
+    AT_LIDAR,
     Calibration,
     Labels,
     boxes_to_lidar,
     drop_non_finite,
+    has_camera,
     read_calibration,
     read_labels,
     read_points,
@@ -75,7 +77,7 @@ def evaluate(
     predictions: Sequence[Labels],
     *,
     classes: Sequence[str] = CLASSES,
-    levels: Sequence[Level] = LEVELS,
+    levels: Sequence[Level] | None = None,
     score_threshold: float | None = None,
     points: Sequence[Integers] | None = None,
 ) -> dict[str, dict[str, Any]]:
@@ -85,8 +87,11 @@ def evaluate(
     a list of one figure in per cent for every level, None where there is no ground truth; `loose`, the same at the
     loose overlaps; `levels`, their names; `counts`; `report`, what is missed and what is found wrongly at one score,
     `score_threshold` or that of the best F1; `warnings`; and `curves`, for strict and loose overlaps and every metric
-    one `Counts` a level, thinned to CURVE_STEPS. `points` are for every frame the numbers of points in the boxes of its
-    labels (K,), see `count_points`; without them the report's recall by points is None.
+    one `Counts` a level, thinned to CURVE_STEPS.
+
+    `levels` are by default KITTI's, without their least height in the image where no label has a 2D box. `points` are
+    for every frame the numbers of points in the boxes of its labels (K,), see `count_points`; without them the report's
+    recall by points is None.
     """
     if len(labels) != len(predictions):
         raise ValueError(f"predictions: want one for each of the {len(labels)} labels, got {len(predictions)}")
@@ -98,6 +103,8 @@ def evaluate(
     if points is not None and [len(frame) for frame in points] != [len(frame) for frame in labels]:
         raise ValueError("points: want one number for every row of every frame's labels, DontCare too")
     candidates = find_candidates(labels, predictions)
+    if levels is None:
+        levels = LEVELS if _has(candidates.truths, "2d") else LEVELS_WITHOUT_2D
     all_points = None if points is None else np.concatenate(points)
     result = {}
     for name in classes:
@@ -458,7 +465,8 @@ def _read_point_counts(folder: Path, frames: Sequence[str], labels: Sequence[Lab
     counts = []
     for frame, label in zip(tqdm(frames, "counting points", disable=None, leave=False), labels, strict=True):
         points, _ = drop_non_finite(read_points(folder / "velodyne" / f"{frame}.bin"))
-        counts.append(count_points(points, label, read_calibration(folder / "calib" / f"{frame}.txt")))
+        calib = read_calibration(folder / "calib" / f"{frame}.txt") if has_camera(folder) else AT_LIDAR
+        counts.append(count_points(points, label, calib))
     return counts
 
 
@@ -514,7 +522,7 @@ def main(argv: Sequence[str] | None) -> None:
         "--clouds",
         type=Path,
         metavar="DIR",
-        help="folder with velodyne/ and calib/: the report adds the recall by number of points in the box",
+        help="folder with velodyne/ and calib/ (none without a camera): adds the recall by number of points in the box",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write the precision-recall curves")
@@ -524,7 +532,7 @@ def main(argv: Sequence[str] | None) -> None:
         raise InputError(f"{args.plot}: not the name of a picture; let it end in .png, .pdf or .svg")
     if args.score is not None and not math.isfinite(args.score):
         raise InputError(f"--score {args.score}: want a finite number")
-    levels = LEVELS_WITHOUT_2D if args.no_2d_filter else LEVELS
+    levels: Sequence[Level] | None = LEVELS_WITHOUT_2D if args.no_2d_filter else None
     if args.distance_bands:
         levels = distance_levels(args.distance_bands)
     frames, labels, predictions = read_folders(args.labels, args.predictions, args.frames, args.missing_as_empty)

@@ -22,6 +22,8 @@ from hvnet.boxes import limit_angle
 from hvnet.cli import InputError
 from hvnet.config import config_to_dict
 from hvnet.data.kitti import (
+    AT_LIDAR,
+    NO_IMAGE,
     Calibration,
     boxes_to_lidar,
     project_boxes,
@@ -30,7 +32,7 @@ from hvnet.data.kitti import (
     read_points,
     write_labels,
 )
-from hvnet.detect import NO_IMAGE, Cloud, check_results, csv_rows, main, result_rows, submission_rows
+from hvnet.detect import Cloud, check_results, csv_rows, main, result_rows, submission_rows
 from hvnet.detector import load
 from hvnet.model import Detections, load_checkpoint, save_checkpoint
 from tests.models import TINY, save_untrained
@@ -140,7 +142,7 @@ def test_results_without_calibration(checkpoint: Path, cloud: NDArray[np.float32
     assert (labels.truncation == -1).all()
     assert (labels.occlusion == -1).all()
     assert (np.abs(labels.alpha) <= 3.1416).all()
-    assert_agrees(tmp_path / "out", "cloud", table(tmp_path / "out"), NO_IMAGE)
+    assert_agrees(tmp_path / "out", "cloud", table(tmp_path / "out"), AT_LIDAR)
     assert not (tmp_path / "out" / "pictures").exists()
 
 
@@ -162,7 +164,7 @@ def test_odd_clouds(checkpoint: Path, tmp_path: Path, points: NDArray) -> None:
     np.save(tmp_path / "cloud.npy", points)
     detect(checkpoint, tmp_path / "out", tmp_path / "cloud.npy")
     assert (tmp_path / "out" / "pictures" / "cloud.png").is_file()
-    assert_agrees(tmp_path / "out", "cloud", table(tmp_path / "out"), NO_IMAGE)
+    assert_agrees(tmp_path / "out", "cloud", table(tmp_path / "out"), AT_LIDAR)
 
 
 def test_no_detections(checkpoint: Path, cloud: NDArray[np.float32], tmp_path: Path) -> None:
@@ -234,7 +236,7 @@ def test_boxes_outside_the_image_are_in_the_table_alone(scenes: Path) -> None:
     rows = result_rows(found, cloud, ("Car", "Van"))
     assert rows.name.tolist() == ["Van"]
     assert rows.score == pytest.approx([0.9])
-    assert len(result_rows(found, cloud._replace(calib=None), ("Car", "Van"))) == 3
+    assert len(result_rows(found, cloud._replace(image_size=NO_IMAGE), ("Car", "Van"))) == 3
     assert [row[:3] for row in csv_rows("a", found, ("Car", "Van"))] == [
         ["a", "Van", "0.9000"],
         ["a", "Car", "0.8000"],
@@ -288,6 +290,14 @@ def test_set(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
     (root / "testing" / "image_2").mkdir()
     Image.new("RGB", (1224, 370)).save(root / "testing" / "image_2" / "000000.png")
     return root
+
+
+def test_a_submission_wants_2d_boxes(checkpoint: Path, test_set: Path, tmp_path: Path) -> None:
+    shutil.rmtree(test_set / "testing" / "calib")
+    with pytest.raises(InputError, match=r"--split test: there is no testing/calib"):
+        detect(checkpoint, tmp_path / "out", test_set, options=("--split", "test"))
+    detect(checkpoint, tmp_path / "out", test_set, options=("--split", "test", "--partial"))  # as of a LiDAR alone
+    assert (read_labels(tmp_path / "out" / "results" / "000000.txt", scored=True).bbox == -1).all()
 
 
 def test_submission(checkpoint: Path, test_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

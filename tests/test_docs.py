@@ -6,6 +6,7 @@ installation by .ci/run. Not run: trtexec (docs/deploy.md) and how pictures are 
 
 import importlib
 import importlib.util
+import json
 import re
 import shlex
 import shutil
@@ -15,10 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hvnet import train
+from hvnet import detect, errors, figures, train
 from hvnet.cli import InputError
 from hvnet.config import config_to_dict, load_config
-from hvnet.data.kitti import read_frame, read_split
+from hvnet.data.kitti import read_frame, read_labels, read_split
 from hvnet.model import HVNet, save_checkpoint
 from hvnet.study import STUDIES
 from tests.test_layout import ROOT
@@ -143,22 +144,37 @@ def test_command(
         main(arguments)
 
 
-def test_own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The worked example of docs/own_data.md: the folder that it writes holds what it was given, and trains."""
+def test_own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """The worked example of docs/own_data.md: the folder that it writes holds what it was given, trains and is scored,
+    all round and without a camera."""
     monkeypatch.chdir(tmp_path)
-    points = np.random.default_rng(0).uniform((0, -10, -2, 0), (25, 10, 1, 1), (500, 4))
-    boxes = np.array([[10.0, 1.0, -1.0, 4.0, 1.6, 1.5, 0.3], [15.0, -3.0, -0.9, 0.8, 0.7, 1.7, -2.0]])
+    points = np.random.default_rng(0).uniform((-12, -12, -2, 0), (12, 12, 1, 1), (500, 4))
+    boxes = np.array([[10.0, 1.0, -1.0, 4.0, 1.6, 1.5, 0.3], [-9.0, -3.0, -0.9, 0.8, 0.7, 1.7, -2.0]])
     text = (ROOT / "docs" / "own_data.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"^```python\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
     exec(code, {"my_frames": [(points, boxes, ["Car", "Pedestrian"])] * 5})
     frame = read_frame(Path("mine"), "000004")
     np.testing.assert_allclose(frame.boxes.numpy(), boxes, atol=0.01)
     assert frame.names == ("Car", "Pedestrian")
-    assert 200 < len(frame.points) <= 500
+    assert len(frame.points) == 500
     assert (len(read_split(Path("mine"), "train")), len(read_split(Path("mine"), "val"))) == (4, 1)
     given = ["--config", str(ROOT / "configs" / "compact.yaml"), "--data", "mine", "--out", "run", "--device", "cpu"]
-    train.main([*given, *SETTINGS, *(part for each in ONCE for part in ("--set", each))])
-    assert (tmp_path / "run" / "checkpoint.pt").is_file()
+    changes = [*ONCE, "train.pictures=1", "encoder.point_range=[-12.8, -12.8, -3, 12.8, 12.8, 2]"]
+    train.main([*given, *SETTINGS, *(part for each in changes for part in ("--set", each))])
+    scored = json.loads((tmp_path / "run" / "metrics.jsonl").read_text().splitlines()[-1])["validation"]
+    assert scored["Car"]["exact"]["bev"][1] is not None
+    errors.main(["run", "--device", "cpu", "--min-score", "0"])
+    page = (tmp_path / "run" / "errors.html").read_text()
+    assert "9.5 m away" in page  # the pedestrian behind
+    given = ["--checkpoint", "run/checkpoint.pt", "--device", "cpu"]
+    capsys.readouterr()
+    detect.main(["mine", "--split", "val", *given])
+    assert re.search(r"^\d+ boxes in 1 cloud$", capsys.readouterr().out, flags=re.MULTILINE)
+    found = read_labels(tmp_path / "detections" / "results" / "000004.txt", scored=True)
+    assert (found.location[:, 2] < 0).any()  # behind
+    assert (found.bbox == -1).all()
+    figures.main(["mine", "--split", "val", *given])
+    assert (tmp_path / "figures" / "000004.png").is_file()
 
 
 def test_pages_are_read() -> None:

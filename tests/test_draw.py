@@ -13,8 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from hvnet.boxes import box_corners
-from hvnet.data.kitti import EDGES, NEAR, Calibration, project_boxes, read_frame, read_image, read_split
-from hvnet.detect import NO_IMAGE
+from hvnet.data.kitti import AT_LIDAR, EDGES, NEAR, Calibration, project_boxes, read_frame, read_image, read_split
 from hvnet.draw import (
     FRONT,
     Camera,
@@ -130,8 +129,8 @@ def test_points_by_height_and_by_reflectance() -> None:
 SIZE = (1000, 400)
 CALIB = Calibration(
     p2=np.array([[500.0, 0, 500, 0], [0, 500, 200, 0], [0, 0, 1, 0]]),
-    r0_rect=NO_IMAGE.r0_rect,
-    velo_to_cam=NO_IMAGE.velo_to_cam,
+    r0_rect=AT_LIDAR.r0_rect,
+    velo_to_cam=AT_LIDAR.velo_to_cam,
 )
 """The camera at the LiDAR: u = 500 - 500 y / x, v = 200 - 500 z / x."""
 

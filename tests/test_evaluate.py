@@ -13,6 +13,7 @@ from hvnet.cli import InputError
 from hvnet.data.kitti import Calibration, Labels, read_labels
 from hvnet.evaluate import (
     CLASSES,
+    LEVELS,
     LEVELS_WITHOUT_2D,
     MEASURES,
     count_points,
@@ -248,12 +249,15 @@ def test_data_without_images():
     truths, detections = crowd(), crowd(scored=True)
     for labels in (truths, detections):
         labels.bbox[:] = 0
-    car = evaluate([truths], [detections])["Car"]
+    car = evaluate([truths], [detections], levels=LEVELS)["Car"]
     assert car["exact"] == {"bev": [None] * 3, "3d": [None] * 3}
     assert "--no-2d-filter" in car["warnings"][0]
-    car = evaluate([truths], [detections], levels=LEVELS_WITHOUT_2D)["Car"]
-    assert car["R40"] == {"bev": [100] * 3, "3d": [100] * 3}
-    assert car["warnings"] == []
+    for levels in (LEVELS_WITHOUT_2D, None):  # which are the default where no label has a 2D box
+        car = evaluate([truths], [detections], levels=levels)["Car"]
+        assert car["R40"] == {"bev": [100] * 3, "3d": [100] * 3}
+        assert car["warnings"] == []
+    both = evaluate([truths, crowd()], [detections, crowd(scored=True)])["Car"]  # some have: KITTI's levels
+    assert both["counts"]["ground_truths"] == evaluate([crowd()], [detections])["Car"]["counts"]["ground_truths"]
 
 
 def test_distance_bands():

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,11 @@ from PIL import Image
 from hvnet.boxes import points_in_boxes
 from hvnet.cli import InputError
 from hvnet.data.kitti import (
+    NO_IMAGE,
     Calibration,
     Labels,
     boxes_to_camera,
+    boxes_to_labels,
     boxes_to_lidar,
     detections_to_labels,
     drop_non_finite,
@@ -412,3 +415,35 @@ def test_real_boxes_project_to_their_2d_labels(kitti_root: Path) -> None:
     assert np.concatenate(untruncated).min() > 0.98
     assert np.concatenate(truncated).min() > 0.89
     assert np.concatenate(alphas).max() < 0.04
+
+
+def test_without_a_camera(tmp_path: Path) -> None:
+    """A root without calib: every point is kept, boxes keep their place, and nothing has a 2D box."""
+    boxes = np.array([[10.0, 1.0, -1.0, 4.0, 1.6, 1.5, 0.3], [-9.0, -3.0, -0.9, 0.8, 0.7, 1.7, -2.0]])
+    labels = boxes_to_labels(boxes, ["Car", "Cyclist"])
+    assert (labels.bbox == -1).all()
+    assert labels.location[0] == pytest.approx([-1.0, 1.75, 10.0])  # right, down, ahead; the middle of the bottom
+    folder = tmp_path / "training"
+    for name in ("velodyne", "label_2"):
+        (folder / name).mkdir(parents=True)
+    (tmp_path / "ImageSets").mkdir()
+    (tmp_path / "ImageSets" / "val.txt").write_text("000000\n")
+    points = np.random.default_rng(0).uniform(-20, 20, (100, 4)).astype(np.float32)
+    write_points(folder / "velodyne" / "000000.bin", points)
+    write_labels(folder / "label_2" / "000000.txt", labels)
+    assert read_split(tmp_path, "val") == ["000000"]
+    frame = read_frame(tmp_path, "000000")
+    assert frame.image_size == NO_IMAGE
+    np.testing.assert_array_equal(frame.points.numpy(), points)
+    np.testing.assert_allclose(frame.boxes.numpy(), boxes, atol=0.01)
+    (folder / "calib").mkdir()
+    with pytest.raises(InputError, match=r"frame 000000 has no .*calib.000000\.txt"):
+        read_split(tmp_path, "val")
+
+
+def test_a_missing_calibration_is_no_missing_camera(tmp_path: Path, scenes: Path) -> None:
+    """Labels with 2D boxes had a camera."""
+    shutil.copytree(scenes / "training", tmp_path / "training")
+    shutil.rmtree(tmp_path / "training" / "calib")
+    with pytest.raises(InputError, match=r"000000\.txt: has 2D boxes, but there is no .*training.calib; add it, or"):
+        read_frame(tmp_path, "000000")

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from hvnet.data.kitti import Calibration, Frame, Labels, boxes_to_camera, project_boxes, read_frame
-from hvnet.detect import NO_IMAGE
+from hvnet.data.kitti import AT_LIDAR, Calibration, Frame, Labels, boxes_to_camera, project_boxes, read_frame
 from hvnet.mistakes import FALSE_POSITIVE, MISS, Mistake, find_mistakes, worst
 from hvnet.model import Detections
 
@@ -15,8 +14,8 @@ CLASSES = ("Car", "Pedestrian", "Cyclist")
 SIZE = (1000, 400)
 CALIB = Calibration(
     p2=np.array([[500.0, 0, 500, 0], [0, 500, 200, 0], [0, 0, 1, 0]]),
-    r0_rect=NO_IMAGE.r0_rect,
-    velo_to_cam=NO_IMAGE.velo_to_cam,
+    r0_rect=AT_LIDAR.r0_rect,
+    velo_to_cam=AT_LIDAR.velo_to_cam,
 )
 LENGTH = 4.0
 

@@ -105,6 +105,14 @@ class Calibration:
         return columns.T
 
 
+NO_IMAGE = (0, 0)
+"""The size of the image where there is no camera: then everything is seen, and the 2D boxes are -1."""
+AT_LIDAR = Calibration(
+    p2=np.eye(3, 4), r0_rect=np.eye(3), velo_to_cam=np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]])
+)
+"""Camera axes that stand in the LiDAR and look along its x, where there is no camera."""
+
+
 @dataclass(frozen=True)
 class Frame:
     """One frame, ready for the pipeline: tensors in LiDAR axes, and the labels as in the file for evaluation."""
@@ -129,25 +137,46 @@ def read_frame(
 ) -> Frame:
     """Reads one frame of a KITTI root; `crop` keeps only the points in the camera's view, where objects are labelled.
 
-    The size of the image is that of image_2/ID.png; without this file it is taken to be 1242 x 375.
+    The size of the image is that of image_2/ID.png; without this file it is taken to be 1242 x 375. Where there is no
+    folder calib there is no camera: all points are kept, and labels are in the axes of AT_LIDAR.
     """
     folder = Path(root) / split_dir
-    calib = read_calibration(folder / "calib" / f"{frame_id}.txt")
-    image_size = _image_size(folder / "image_2" / f"{frame_id}.png")
+    calib, labels = read_annotations(folder, frame_id, labelled)
+    image_size = _image_size(folder / "image_2" / f"{frame_id}.png") if has_camera(folder) else NO_IMAGE
     points, dropped = drop_non_finite(read_points(folder / "velodyne" / f"{frame_id}.bin"))
     if crop:
         points = points[in_image(points, calib, image_size)]
-    labels = read_labels(folder / "label_2" / f"{frame_id}.txt") if labelled else _labels([])
     objects = labels.select(labels.name != "DontCare")
     boxes = torch.from_numpy(boxes_to_lidar(objects, calib)).float()
     names = tuple(objects.name.tolist())
     return Frame(frame_id, torch.from_numpy(points), boxes, names, labels, calib, image_size, dropped)
 
 
+def has_camera(folder: Path) -> bool:
+    """Whether a folder such as training/ holds calibrations: else its clouds are those of a LiDAR without a camera."""
+    return (folder / "calib").is_dir()
+
+
+def read_annotations(folder: Path, frame_id: str, labelled: bool = True) -> tuple[Calibration, Labels]:
+    """A frame's calibration and labels, no labels unless `labelled`, from a folder such as training/."""
+    path = folder / "label_2" / f"{frame_id}.txt"
+    labels = read_labels(path) if labelled else _labels([])
+    if has_camera(folder):
+        return read_calibration(folder / "calib" / f"{frame_id}.txt"), labels
+    if (labels.bbox[:, 2:] > labels.bbox[:, :2]).any():
+        raise InputError(f"{path}: has 2D boxes, but there is no {folder / 'calib'}; add it, or make 2D boxes -1")
+    return AT_LIDAR, labels
+
+
 def read_split(root: Path, name: str, split_dir: str = "training", labelled: bool = True) -> list[str]:
-    """Frame ids of ImageSets/NAME.txt, one a line; every one of them has its points, calibration and label file."""
+    """Frame ids of ImageSets/NAME.txt, one a line; every one of them has its points, calibration and label file.
+
+    Where there is no folder calib, no frame needs a calibration (see `has_camera`).
+    """
     path = Path(root) / "ImageSets" / f"{name}.txt"
-    suffixes = {"velodyne": ".bin", "calib": ".txt"} | ({"label_2": ".txt"} if labelled else {})
+    suffixes = {"velodyne": ".bin"} | ({"label_2": ".txt"} if labelled else {})
+    if has_camera(Path(root) / split_dir):
+        suffixes["calib"] = ".txt"
     lines: dict[str, int] = {}
     for number, line in enumerate(_read_lines(path, f"the frames of split '{name}', one id a line"), 1):
         frame_id = line.strip()
@@ -334,8 +363,11 @@ def project_boxes(
     """2D boxes (M, 4) = left, top, right, bottom of boxes (M, 7), clipped to the image, and which are visible (M,).
 
     The 2D box encloses the projection of the part of the box in front of the camera: its corners there, and the points
-    where its edges pass the near plane. It is visible if some of the 2D box lies in the image; else it is zero.
+    where its edges pass the near plane. It is visible if some of the 2D box lies in the image; else it is zero. With
+    NO_IMAGE all are visible, and their 2D boxes -1.
     """
+    if image_size == NO_IMAGE:
+        return np.full((len(boxes), 4), -1.0), np.ones(len(boxes), dtype=np.bool_)
     corners = box_corners(torch.from_numpy(boxes.astype(np.float64))).numpy()
     corners = calib.homogeneous(corners.reshape(-1, 3)).reshape(-1, 8, 3)
     begin, end = corners[:, EDGES[:, 0]], corners[:, EDGES[:, 1]]  # (M, 12, 3)
@@ -354,34 +386,52 @@ def project_boxes(
 
 
 def in_image(points: NDArray[np.floating], calib: Calibration, image_size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Which of the points (N, 3 or more) in LiDAR axes the camera sees: in front of it, inside the image."""
+    """Which of the points (N, 3 or more) in LiDAR axes the camera sees: in front of it, inside the image.
+
+    All of them with NO_IMAGE.
+    """
+    if image_size == NO_IMAGE:
+        return np.ones(len(points), dtype=np.bool_)
     uv, depth = calib.project(points[:, :3])
     u, v = uv.T
     return (depth > 0) & (u >= 0) & (u < image_size[0]) & (v >= 0) & (v < image_size[1])
 
 
-def detections_to_labels(
-    boxes: Tensor, scores: Tensor, names: Sequence[str], calib: Calibration, image_size: tuple[int, int]
+def boxes_to_labels(
+    boxes: NDArray[np.floating],
+    names: Sequence[str],
+    calib: Calibration = AT_LIDAR,
+    image_size: tuple[int, int] = NO_IMAGE,
+    scores: Floats | None = None,
 ) -> Labels:
-    """The rows of a result file for detected boxes (M, 7) with scores (M,) and classes: K <= M.
+    """The rows of a label file for boxes (M, 7) and their classes, or with scores (M,) of a result file: K <= M.
 
-    A box with nothing in the image is not reported: nothing is labelled there.
+    Labels are neither truncated nor occluded; of results nothing is known about that. A box with nothing in the image
+    is left out: nothing is labelled there.
     """
-    boxes_lidar = boxes.detach().cpu().double().numpy()
-    bbox, visible = project_boxes(boxes_lidar, calib, image_size)
-    dimensions, location, rotation_y = boxes_to_camera(boxes_lidar, calib)
+    bbox, visible = project_boxes(boxes, calib, image_size)
+    dimensions, location, rotation_y = boxes_to_camera(boxes, calib)
+    unknown = 0 if scores is None else -1
     labels = Labels(
         name=np.array(names, dtype=np.str_),
-        truncation=np.full(len(boxes), -1.0),
-        occlusion=np.full(len(boxes), -1),
+        truncation=np.full(len(boxes), float(unknown)),
+        occlusion=np.full(len(boxes), unknown),
         alpha=_wrap(rotation_y - np.arctan2(location[:, 0], location[:, 2])),
         bbox=bbox,
         dimensions=dimensions,
         location=location,
         rotation_y=rotation_y,
-        score=scores.detach().cpu().double().numpy(),
+        score=scores,
     )
     return labels.select(visible)
+
+
+def detections_to_labels(
+    boxes: Tensor, scores: Tensor, names: Sequence[str], calib: Calibration, image_size: tuple[int, int]
+) -> Labels:
+    """The rows of a result file for detected boxes (M, 7) with scores (M,) and classes: K <= M."""
+    values = boxes.detach().cpu().double().numpy()
+    return boxes_to_labels(values, names, calib, image_size, scores.detach().cpu().double().numpy())
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
