@@ -29,13 +29,12 @@ from hvnet.data.kitti import (
     detections_to_labels,
     has_camera,
     read_frame,
-    read_image,
     read_labels,
     read_split,
     write_labels,
 )
 from hvnet.detector import Detector, load
-from hvnet.draw import Camera, Subject, draw_bev, draw_frame
+from hvnet.draw import Camera, Subject, camera_at, draw_bev, draw_frame
 from hvnet.evaluate import CLASSES, evaluate, format_table
 from hvnet.model import Detections
 
@@ -132,7 +131,7 @@ def check_test_set(names: Sequence[str]) -> None:
 
 
 def read_source(source: Source, classes: Sequence[str]) -> Cloud:
-    """Reads a source; a KITTI frame comes with its calibration and, where there are labels, the true boxes."""
+    """Reads a source; a KITTI frame comes with its calibration, if any, and, where there are labels, the true boxes."""
     if source.split_dir is None:
         points, notes = read_cloud(source.path)
         return Cloud(torch.from_numpy(points), torch.zeros(0, 7), AT_LIDAR, NO_IMAGE, notes)
@@ -143,11 +142,8 @@ def read_source(source: Source, classes: Sequence[str]) -> Cloud:
 
 
 def camera_of(source: Source, cloud: Cloud) -> Camera | None:
-    """The camera of a KITTI frame with its image, where there is one; None for clouds without a camera."""
-    if cloud.image_size == NO_IMAGE:
-        return None
-    path = source.kitti_file("image_2", ".png")
-    return Camera(cloud.calib, cloud.image_size, None if path is None else read_image(path))
+    """The camera of a cloud with its image, where there is one; None without a camera."""
+    return camera_at(cloud.calib, cloud.image_size, source.kitti_file("image_2", ".png"))
 
 
 def result_rows(found: Detections, cloud: Cloud, classes: Sequence[str]) -> Labels:

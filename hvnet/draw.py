@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hvnet.boxes import bev_corners, box_corners
-from hvnet.data.kitti import EDGES, NEAR, Calibration, Floats, in_image, project_boxes
+from hvnet.data.kitti import EDGES, NEAR, NO_IMAGE, Calibration, Floats, in_image, project_boxes, read_image
 
 FORMATS = ("png", "svg", "pdf")
 TRUTH_COLOUR = "#1a9850"
@@ -58,6 +58,13 @@ class Camera(NamedTuple):
     calib: Calibration
     size: tuple[int, int]  # width, height in pixels
     image: NDArray[np.uint8] | None  # (H, W, 3), None where there is none
+
+
+def camera_at(calib: Calibration, size: tuple[int, int], picture: Path | None) -> Camera | None:
+    """The camera of a frame, with its picture where that file is there; None without a camera."""
+    if size == NO_IMAGE:
+        return None
+    return Camera(calib, size, read_image(picture) if picture is not None and picture.is_file() else None)
 
 
 class Features(NamedTuple):
@@ -185,7 +192,7 @@ def show_bev(axes: Axes, subject: Subject, point_range: Sequence[float], colour:
 
 
 def _whole_bev(axes: Axes, subject: Subject, point_range: Sequence[float], colour: Colour) -> None:
-    """A bird's eye view with a legend, and a bar of its colours in the corner that the camera does not see."""
+    """A bird's eye view with a legend, and a bar of its colours in a corner that a camera does not see."""
     points = show_bev(axes, subject, point_range, colour)
     _colour_bar(points, axes.inset_axes((0.03, 0.05, 0.2, 0.012)), "height (m)" if colour == "height" else colour)
     if axes.get_legend_handles_labels()[0]:

@@ -27,9 +27,9 @@ from PIL import Image
 from tqdm import tqdm
 
 from hvnet.cli import InputError, add_device, make_parser, run_command
-from hvnet.data.kitti import NO_IMAGE, detections_to_labels, project_boxes, read_frame, read_image, read_split
+from hvnet.data.kitti import detections_to_labels, project_boxes, read_frame, read_split
 from hvnet.detector import Detector, load
-from hvnet.draw import CLASS_COLOURS, TRUTH_COLOUR, Camera, Subject, show_bev, show_camera
+from hvnet.draw import CLASS_COLOURS, TRUTH_COLOUR, Camera, Subject, camera_at, show_bev, show_camera
 from hvnet.evaluate import CLASSES, MIN_OVERLAPS, evaluate, format_table
 from hvnet.kernels.rotated import rotated_iou_bev
 from hvnet.mistakes import MISS, Mistake, find_mistakes, worst
@@ -254,8 +254,7 @@ def make_crop(mistake: Mistake, detector: Detector, root: Path, found: Detection
     """Reads the mistake's frame again and draws it."""
     frame = read_frame(root, mistake.frame)
     path = root / "training" / "image_2" / f"{mistake.frame}.png"
-    image = read_image(path) if path.is_file() else None
-    camera = None if frame.image_size == NO_IMAGE else Camera(frame.calib, frame.image_size, image)
+    camera = camera_at(frame.calib, frame.image_size, path)
     own = found.labels == detector.classes.index(mistake.name)
     shown = (found.scores >= min_score) | (own & (rotated_iou_bev(mistake.box[None], found.boxes)[0] > 0))
     found = Detections(found.boxes[shown], found.scores[shown], found.labels[shown])

@@ -33,8 +33,9 @@ from hvnet.data.database import FILE_NAME, Database, build_database, read_databa
 from hvnet.data.kitti import (
     Labels,
     detections_to_labels,
-    read_annotations,
+    frame_calibration,
     read_frame,
+    read_labels,
     read_points,
     read_split,
 )
@@ -480,7 +481,7 @@ def check_frames(root: Path, names: list[str], skip: bool, say: Callable[..., No
 def check_frame(root: Path, name: str) -> None:
     """Reads the small files of a frame, so that a mistake in one of them is found now and not epochs later."""
     folder = root / "training"
-    read_annotations(folder, name)
+    frame_calibration(folder, name, read_labels(folder / "label_2" / f"{name}.txt"))
     points = folder / "velodyne" / f"{name}.bin"
     if points.stat().st_size % 16:
         read_points(points)  # which says what is wrong

@@ -242,6 +242,9 @@ def test_objects_that_are_hardly_seen_are_not_inserted() -> None:
     database = make_objects(objects, **columns)
     _, boxes, _ = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(), CLASSES)
     assert boxes.tolist() == [car(30, 0)]
+    database = make_objects(objects, **columns | {"bbox_height": [0] * 4})  # without a camera
+    _, boxes, _ = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(), CLASSES)
+    assert boxes[:, 0].sort().values.tolist() == [20, 30]
     for points_each, inserted in ((4, 0), (5, 4)):
         database = make_objects(objects, points_each)
         _, boxes, _ = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(), CLASSES)

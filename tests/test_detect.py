@@ -236,7 +236,7 @@ def test_boxes_outside_the_image_are_in_the_table_alone(scenes: Path) -> None:
     rows = result_rows(found, cloud, ("Car", "Van"))
     assert rows.name.tolist() == ["Van"]
     assert rows.score == pytest.approx([0.9])
-    assert len(result_rows(found, cloud._replace(image_size=NO_IMAGE), ("Car", "Van"))) == 3
+    assert len(result_rows(found, cloud._replace(calib=AT_LIDAR, image_size=NO_IMAGE), ("Car", "Van"))) == 3
     assert [row[:3] for row in csv_rows("a", found, ("Car", "Van"))] == [
         ["a", "Van", "0.9000"],
         ["a", "Car", "0.8000"],
@@ -294,6 +294,9 @@ def test_set(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
 
 def test_a_submission_wants_2d_boxes(checkpoint: Path, test_set: Path, tmp_path: Path) -> None:
     shutil.rmtree(test_set / "testing" / "calib")
+    with pytest.raises(InputError, match=r"testing.calib: no such folder, but there is image_2; add the calibrations"):
+        detect(checkpoint, tmp_path / "out", test_set, options=("--split", "test"))
+    shutil.rmtree(test_set / "testing" / "image_2")
     with pytest.raises(InputError, match=r"--split test: there is no testing/calib"):
         detect(checkpoint, tmp_path / "out", test_set, options=("--split", "test"))
     detect(checkpoint, tmp_path / "out", test_set, options=("--split", "test", "--partial"))  # as of a LiDAR alone

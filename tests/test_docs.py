@@ -10,11 +10,14 @@ import json
 import re
 import shlex
 import shutil
+from base64 import b64decode
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from hvnet import detect, errors, figures, train
 from hvnet.cli import InputError
@@ -166,6 +169,10 @@ def test_own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     errors.main(["run", "--device", "cpu", "--min-score", "0"])
     page = (tmp_path / "run" / "errors.html").read_text()
     assert "9.5 m away" in page  # the pedestrian behind
+    with Image.open(BytesIO(b64decode(re.findall(r'class="crop".*?base64,([^"]+)"', page)[0]))) as crop:
+        assert crop.width == pytest.approx(crop.height, rel=0.1)  # from above alone
+    (far,) = re.findall(r'--set "(encoder\.point_range=.*?)"', text)
+    assert load_config(ROOT / "configs" / "compact.yaml", [far]).encoder.point_range[0] < 0
     given = ["--checkpoint", "run/checkpoint.pt", "--device", "cpu"]
     capsys.readouterr()
     detect.main(["mine", "--split", "val", *given])

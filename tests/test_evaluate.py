@@ -1,6 +1,9 @@
 import csv
+import dataclasses
 import json
 import math
+import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +13,13 @@ from conftest import SHARED
 
 from hvnet.boxes import box_corners
 from hvnet.cli import InputError
-from hvnet.data.kitti import Calibration, Labels, read_labels
+from hvnet.data.kitti import Calibration, Labels, boxes_to_labels, read_labels, write_labels, write_points
 from hvnet.evaluate import (
     CLASSES,
     LEVELS,
     LEVELS_WITHOUT_2D,
     MEASURES,
+    NO_2D_FILTER,
     count_points,
     distance_levels,
     evaluate,
@@ -252,12 +256,27 @@ def test_data_without_images():
     car = evaluate([truths], [detections], levels=LEVELS)["Car"]
     assert car["exact"] == {"bev": [None] * 3, "3d": [None] * 3}
     assert "--no-2d-filter" in car["warnings"][0]
-    for levels in (LEVELS_WITHOUT_2D, None):  # which are the default where no label has a 2D box
-        car = evaluate([truths], [detections], levels=levels)["Car"]
-        assert car["R40"] == {"bev": [100] * 3, "3d": [100] * 3}
-        assert car["warnings"] == []
-    both = evaluate([truths, crowd()], [detections, crowd(scored=True)])["Car"]  # some have: KITTI's levels
+    car = evaluate([truths], [detections], levels=LEVELS_WITHOUT_2D)["Car"]
+    assert car["R40"] == {"bev": [100] * 3, "3d": [100] * 3}
+    assert car["warnings"] == []
+    car = evaluate([truths], [detections])["Car"]  # these levels are the default where no label has a 2D box
+    assert car["R40"] == {"bev": [100] * 3, "3d": [100] * 3}
+    assert car["warnings"] == ["no label has a 2D box: the levels go by occlusion and truncation alone"]
+    nothing = truths.select(np.zeros(0, np.int64))
+    assert evaluate([nothing], [detections])["Car"]["report"]["false_positives"] == [len(truths) // 3] * 3
+
+
+def test_some_labels_have_2d_boxes():
+    """KITTI's levels, which count those alone, and a warning that says so."""
+    truths, detections = crowd(), crowd(scored=True)
+    for labels in (truths, detections):
+        labels.bbox[:] = -1
+    both = evaluate([truths, crowd()], [detections, crowd(scored=True)])["Car"]
     assert both["counts"]["ground_truths"] == evaluate([crowd()], [detections])["Car"]["counts"]["ground_truths"]
+    count = both["counts"]["ground_truths"][0]
+    assert both["warnings"] == [
+        f"{count} of {2 * count} labels have no 2D box, which these levels ask for: {NO_2D_FILTER}"
+    ]
 
 
 def test_distance_bands():
@@ -399,6 +418,27 @@ def test_wrong_frames_file(folders: list[str], tmp_path: Path, text: str, messag
     path.write_text(text)
     with pytest.raises(InputError, match=message):
         main([*folders, "--frames", str(path)])
+
+
+def test_points_without_a_camera(folders: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """No calib beside the clouds: there is no camera, unless labels have 2D boxes."""
+    boxes = np.array([[10.0, 1.0, -1.0, 4.0, 1.6, 1.5, 0.3], [-9.0, -3.0, -1.0, 4.0, 1.6, 1.5, 0.0]])
+    root = tmp_path / "lidar"
+    for name in ("velodyne", "label_2", "results"):
+        (root / name).mkdir(parents=True)
+    labels = boxes_to_labels(boxes, ["Car", "Car"])
+    write_labels(root / "label_2" / "000000.txt", labels)
+    write_labels(root / "results" / "000000.txt", dataclasses.replace(labels, score=np.array([0.9, 0.8])))
+    write_points(root / "velodyne" / "000000.bin", np.array([[-9, -3, -1, 0]] * 20, dtype=np.float32))
+    given = ["--labels", str(root / "label_2"), "--predictions", str(root / "results"), "--classes", "Car"]
+    main([*given, "--clouds", str(root)])
+    printed = capsys.readouterr().out
+    for points in ("0-9 points", "10-49"):
+        assert re.search(rf"{points}( +100\.0 of 1){{3}}$", printed, flags=re.MULTILINE)
+    for name in ("000003", "000007"):
+        shutil.copy(root / "velodyne" / "000000.bin", root / "velodyne" / f"{name}.bin")
+    with pytest.raises(InputError, match=r"lidar.calib: no such folder, but the labels of frame \d+ have 2D boxes"):
+        main([*folders, "--clouds", str(root)])
 
 
 def test_duplicate_file(folders: list[str], tmp_path: Path):

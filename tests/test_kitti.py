@@ -38,6 +38,8 @@ SIZE = (1242, 375)
 CAR = "Car 0.25 1 -1.50 100.00 120.50 300.25 240.75 1.50 1.60 4.00 2.00 1.70 10.00 -1.30"
 DONT_CARE = "DontCare -1 -1 -10 800.38 163.67 825.45 184.07 -1 -1 -1 -1000 -1000 -1000 -10"
 
+BOXES = np.array([[10.0, 1.0, -1.0, 4.0, 1.6, 1.5, 0.3], [-9.0, -3.0, -0.9, 0.8, 0.7, 1.7, -2.0]])
+
 # a camera at the LiDAR's origin that looks along +x: camera x = -y, camera y = -z, camera z = x
 PLAIN = Calibration(
     p2=np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]]),
@@ -417,33 +419,58 @@ def test_real_boxes_project_to_their_2d_labels(kitti_root: Path) -> None:
     assert np.concatenate(alphas).max() < 0.04
 
 
-def test_without_a_camera(tmp_path: Path) -> None:
-    """A root without calib: every point is kept, boxes keep their place, and nothing has a 2D box."""
-    boxes = np.array([[10.0, 1.0, -1.0, 4.0, 1.6, 1.5, 0.3], [-9.0, -3.0, -0.9, 0.8, 0.7, 1.7, -2.0]])
-    labels = boxes_to_labels(boxes, ["Car", "Cyclist"])
-    assert (labels.bbox == -1).all()
-    assert labels.location[0] == pytest.approx([-1.0, 1.75, 10.0])  # right, down, ahead; the middle of the bottom
-    folder = tmp_path / "training"
+def lidar_alone(root: Path) -> Path:
+    """A root of one frame without a camera; some of its points and objects are behind the sensor."""
+    folder = root / "training"
     for name in ("velodyne", "label_2"):
         (folder / name).mkdir(parents=True)
-    (tmp_path / "ImageSets").mkdir()
-    (tmp_path / "ImageSets" / "val.txt").write_text("000000\n")
+    (root / "ImageSets").mkdir()
+    (root / "ImageSets" / "val.txt").write_text("000000\n")
     points = np.random.default_rng(0).uniform(-20, 20, (100, 4)).astype(np.float32)
     write_points(folder / "velodyne" / "000000.bin", points)
-    write_labels(folder / "label_2" / "000000.txt", labels)
-    assert read_split(tmp_path, "val") == ["000000"]
-    frame = read_frame(tmp_path, "000000")
+    write_labels(folder / "label_2" / "000000.txt", boxes_to_labels(BOXES, ["Car", "Cyclist"]))
+    return root
+
+
+def test_without_a_camera(tmp_path: Path) -> None:
+    """A root without calib: every point is kept, boxes keep their place, and nothing has a 2D box."""
+    labels = boxes_to_labels(BOXES, ["Car", "Cyclist"])
+    assert (labels.bbox == -1).all()
+    assert labels.location[0] == pytest.approx([-1.0, 1.75, 10.0])  # right, down, ahead; the middle of the bottom
+    root = lidar_alone(tmp_path)
+    assert read_split(root, "val") == ["000000"]
+    frame = read_frame(root, "000000")
     assert frame.image_size == NO_IMAGE
-    np.testing.assert_array_equal(frame.points.numpy(), points)
-    np.testing.assert_allclose(frame.boxes.numpy(), boxes, atol=0.01)
-    (folder / "calib").mkdir()
+    np.testing.assert_array_equal(frame.points.numpy(), read_points(root / "training" / "velodyne" / "000000.bin"))
+    assert (frame.points[:, 0] < 0).any()
+    np.testing.assert_allclose(frame.boxes.numpy(), BOXES, atol=0.01)
+    (root / "training" / "calib").mkdir()
     with pytest.raises(InputError, match=r"frame 000000 has no .*calib.000000\.txt"):
-        read_split(tmp_path, "val")
+        read_split(root, "val")
 
 
 def test_a_missing_calibration_is_no_missing_camera(tmp_path: Path, scenes: Path) -> None:
-    """Labels with 2D boxes had a camera."""
-    shutil.copytree(scenes / "training", tmp_path / "training")
-    shutil.rmtree(tmp_path / "training" / "calib")
-    with pytest.raises(InputError, match=r"000000\.txt: has 2D boxes, but there is no .*training.calib; add it, or"):
-        read_frame(tmp_path, "000000")
+    """Where there are images, or labels with 2D boxes, there was a camera."""
+    root = lidar_alone(tmp_path)
+    folder = root / "training"
+    (folder / "calib").symlink_to("gone")
+    with pytest.raises(InputError, match=r"training.calib: is no folder of calibrations"):
+        read_split(root, "val")
+    (folder / "calib").unlink()
+    (folder / "image_2").mkdir()
+    with pytest.raises(InputError, match=r"training.calib: no such folder, but there is image_2; add"):
+        read_frame(root, "000000")
+    (folder / "image_2").rmdir()
+    shutil.copy(scenes / "training" / "label_2" / "000000.txt", folder / "label_2")
+    with pytest.raises(InputError, match=r"calib: no such folder, but the labels of frame 000000 have 2D boxes; add"):
+        read_frame(root, "000000")
+
+
+def test_labels_of_boxes_with_a_camera() -> None:
+    labels = boxes_to_labels(BOXES, ["Car", "Cyclist"], PLAIN, SIZE)
+    assert labels.name.tolist() == ["Car"]  # the other is behind the camera
+    np.testing.assert_allclose(labels.bbox, project_boxes(BOXES[:1], PLAIN, SIZE)[0])
+    np.testing.assert_allclose(boxes_to_lidar(labels, PLAIN), BOXES[:1])
+    assert (labels.truncation.tolist(), labels.occlusion.tolist(), labels.score) == ([0.0], [0], None)
+    with pytest.raises(ValueError, match="image_size: want that of the calibration's camera"):
+        boxes_to_labels(BOXES, ["Car", "Cyclist"], PLAIN)

@@ -20,7 +20,7 @@ from PIL import Image
 from hvnet import study
 from hvnet.cli import InputError
 from hvnet.config import load_config
-from hvnet.data.kitti import read_frame, read_split
+from hvnet.data.kitti import boxes_to_labels, read_frame, read_split, write_labels
 from hvnet.detector import Detector
 from hvnet.model import Detections, HVNet, load_checkpoint
 from hvnet.study import STUDIES, Outcome, Row, agreement, main, with_budget
@@ -136,7 +136,7 @@ def test_agreement_of_seeds() -> None:
     assert agreement([empty])[:2] == (0, 0)
 
 
-def test_score_counts_objects_in_range(scenes: Path) -> None:
+def test_score_counts_objects_in_range(scenes: Path, tmp_path: Path) -> None:
     """A detector that says what is labelled scores 100, also if it knows nothing of what lies beyond its range."""
     config = load_config(CONFIGS / "studies" / "base.yaml", ["encoder.point_range=[0, -12.8, -3, 15, 12.8, 2]"])
     ids = read_split(scenes, "val")
@@ -162,6 +162,11 @@ def test_score_counts_objects_in_range(scenes: Path) -> None:
     assert sum(table["bev"][2] or 0.0 for table in worse.values()) < 290
     cars = study.count_cars(config, scenes, ids)
     assert 0 < cars < sum(frame.names.count("Car") for frame in (read_frame(scenes, name) for name in ids)) + 1
+    for folder in ("velodyne", "label_2"):
+        shutil.copytree(scenes / "training" / folder, tmp_path / "training" / folder)
+    boxes = np.array([[x, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0] for x in (5.0, 10.0, 20.0)])
+    write_labels(tmp_path / "training" / "label_2" / f"{ids[0]}.txt", boxes_to_labels(boxes, ["Car"] * 3))
+    assert study.count_cars(config, tmp_path, ids[:1]) == 2  # without a camera, one of three out of range
 
 
 @pytest.mark.parametrize(

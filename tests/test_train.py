@@ -456,6 +456,13 @@ def test_a_disk_without_room_is_found_before_the_run(
     assert not (tmp_path / "new").exists()
 
 
+def test_a_root_without_its_calibrations_is_refused_at_once(copied: Path, tmp_path: Path) -> None:
+    shutil.rmtree(copied / "training" / "calib")
+    with pytest.raises(InputError, match=r"training.calib: no such folder, but the labels of frame \d+ have 2D boxes"):
+        run(copied, tmp_path / "out")
+    assert not (tmp_path / "out" / "checkpoint.pt").exists()
+
+
 @pytest.mark.parametrize("place", ["label", "points", "points that change during the run"])
 def test_a_corrupt_frame_is_named_and_skipped(
     copied: Path, tmp_path: Path, place: str, monkeypatch: pytest.MonkeyPatch

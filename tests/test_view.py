@@ -22,6 +22,7 @@ import torch
 from PIL import Image
 
 from hvnet.cli import InputError
+from hvnet.data.kitti import boxes_to_labels, write_labels
 from hvnet.detect import Source, find_sources
 from hvnet.detector import Detector, load
 from hvnet.kernels.voxel import make_grid
@@ -149,6 +150,20 @@ def test_what_a_scene_holds(scenes: Path, tmp_path: Path) -> None:
     scene = read_scene(Source("a", cloud, None))
     assert len(scene.points) * 16 == cloud.stat().st_size
     assert scene[1:] == (None, None, [])
+
+
+def test_a_scene_without_a_camera(scenes: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "training"
+    for name in ("velodyne", "label_2"):
+        (folder / name).mkdir(parents=True)
+    shutil.copy(scenes / "training" / "velodyne" / "000000.bin", folder / "velodyne")
+    boxes = np.array([[-9.0, -3.0, -0.9, 0.8, 0.7, 1.7, -2.0]])
+    write_labels(folder / "label_2" / "000000.txt", boxes_to_labels(boxes, ["Pedestrian"]))
+    scene = read_scene(Source("000000", tmp_path, "training"))
+    assert len(scene.points) * 16 == (folder / "velodyne" / "000000.bin").stat().st_size
+    assert scene.frame is not None
+    np.testing.assert_allclose(scene.frame.boxes.numpy(), boxes, atol=0.01)
+    assert scene.image is None
 
 
 # --- the command -----------------------------------------------------------------------------------------------------

@@ -32,8 +32,9 @@ class Objects(NamedTuple):
 def objects_of(database: Database, device: torch.device) -> Objects:
     """The database with its points on a device, and its rows by class and by frame."""
     has_points = np.diff(database.offsets) >= MIN_POINTS
-    # rated by KITTI: easy, moderate or hard; SECOND leaves out the others
-    rated = (database.bbox_height > 25) & (database.occlusion <= 2) & (database.truncation <= 0.5)
+    # rated by KITTI: easy, moderate or hard; SECOND leaves out the others. Without a camera there are no heights
+    high = (database.bbox_height > 25) | (not database.bbox_height.any())
+    rated = high & (database.occlusion <= 2) & (database.truncation <= 0.5)
     of_class = {str(n): np.flatnonzero(rated & has_points & (database.name == n)) for n in np.unique(database.name)}
     by_frame = np.argsort(database.frame, kind="stable")
     _, starts = np.unique(database.frame[by_frame], return_index=True)

@@ -123,7 +123,7 @@ class Frame:
     names: tuple[str, ...]  # M classes
     labels: Labels  # all K >= M rows of the label file; none if the frame was read without labels
     calib: Calibration
-    image_size: tuple[int, int]  # width, height in pixels
+    image_size: tuple[int, int]  # width, height in pixels; NO_IMAGE without a camera
     dropped: int  # points of the file that were not finite
 
     @property
@@ -141,7 +141,8 @@ def read_frame(
     folder calib there is no camera: all points are kept, and labels are in the axes of AT_LIDAR.
     """
     folder = Path(root) / split_dir
-    calib, labels = read_annotations(folder, frame_id, labelled)
+    labels = read_labels(folder / "label_2" / f"{frame_id}.txt") if labelled else _labels([])
+    calib = frame_calibration(folder, frame_id, labels)
     image_size = _image_size(folder / "image_2" / f"{frame_id}.png") if has_camera(folder) else NO_IMAGE
     points, dropped = drop_non_finite(read_points(folder / "velodyne" / f"{frame_id}.bin"))
     if crop:
@@ -153,19 +154,33 @@ def read_frame(
 
 
 def has_camera(folder: Path) -> bool:
-    """Whether a folder such as training/ holds calibrations: else its clouds are those of a LiDAR without a camera."""
-    return (folder / "calib").is_dir()
+    """Whether a folder such as training/ holds calibrations: else its clouds are those of a LiDAR without a camera.
+
+    Raises InputError where they seem to be missing: a camera's images are there.
+    """
+    calib = folder / "calib"
+    if calib.is_dir():
+        return True
+    if calib.exists() or calib.is_symlink():
+        raise InputError(f"{calib}: is no folder of calibrations; mend it, or remove it if there is no camera")
+    if (folder / "image_2").is_dir():
+        raise InputError(f"{calib}: no such folder, but there is image_2; add the calibrations, or remove the images")
+    return False
 
 
-def read_annotations(folder: Path, frame_id: str, labelled: bool = True) -> tuple[Calibration, Labels]:
-    """A frame's calibration and labels, no labels unless `labelled`, from a folder such as training/."""
-    path = folder / "label_2" / f"{frame_id}.txt"
-    labels = read_labels(path) if labelled else _labels([])
+def frame_calibration(folder: Path, frame_id: str, labels: Labels) -> Calibration:
+    """The calibration of a frame with these labels; AT_LIDAR without a camera.
+
+    Raises InputError where labels have 2D boxes and there is no calibration: their axes are those of a camera.
+    """
     if has_camera(folder):
-        return read_calibration(folder / "calib" / f"{frame_id}.txt"), labels
+        return read_calibration(folder / "calib" / f"{frame_id}.txt")
     if (labels.bbox[:, 2:] > labels.bbox[:, :2]).any():
-        raise InputError(f"{path}: has 2D boxes, but there is no {folder / 'calib'}; add it, or make 2D boxes -1")
-    return AT_LIDAR, labels
+        raise InputError(
+            f"{folder / 'calib'}: no such folder, but the labels of frame {frame_id} have 2D boxes; "
+            "add it, or, without a camera, make the 2D boxes -1"
+        )
+    return AT_LIDAR
 
 
 def read_split(root: Path, name: str, split_dir: str = "training", labelled: bool = True) -> list[str]:
@@ -407,15 +422,17 @@ def boxes_to_labels(
     """The rows of a label file for boxes (M, 7) and their classes, or with scores (M,) of a result file: K <= M.
 
     Labels are neither truncated nor occluded; of results nothing is known about that. A box with nothing in the image
-    is left out: nothing is labelled there.
+    is left out: nothing is labelled there. Raises ValueError for a calibration without the size of its image.
     """
+    if image_size == NO_IMAGE and calib is not AT_LIDAR:
+        raise ValueError("image_size: want that of the calibration's camera, got none")
     bbox, visible = project_boxes(boxes, calib, image_size)
     dimensions, location, rotation_y = boxes_to_camera(boxes, calib)
-    unknown = 0 if scores is None else -1
+    rating = 0 if scores is None else -1
     labels = Labels(
         name=np.array(names, dtype=np.str_),
-        truncation=np.full(len(boxes), float(unknown)),
-        occlusion=np.full(len(boxes), unknown),
+        truncation=np.full(len(boxes), float(rating)),
+        occlusion=np.full(len(boxes), rating),
         alpha=_wrap(rotation_y - np.arctan2(location[:, 0], location[:, 2])),
         bbox=bbox,
         dimensions=dimensions,
@@ -429,7 +446,7 @@ def boxes_to_labels(
 def detections_to_labels(
     boxes: Tensor, scores: Tensor, names: Sequence[str], calib: Calibration, image_size: tuple[int, int]
 ) -> Labels:
-    """The rows of a result file for detected boxes (M, 7) with scores (M,) and classes: K <= M."""
+    """The rows of a result file for detected boxes (M, 7) with scores (M,) and classes: K <= M are in the image."""
     values = boxes.detach().cpu().double().numpy()
     return boxes_to_labels(values, names, calib, image_size, scores.detach().cpu().double().numpy())
 
