@@ -415,17 +415,17 @@ def draw_trained(path: Path, name: str, outcomes: Sequence[Outcome], times: dict
     figure = Figure(figsize=(8, 5 if study.curves else 1.4 + 0.45 * len(rows)), layout="constrained")
     axes = figure.add_subplot()
     if study.curves:
-        for curve, colour in zip(study.curves, ("#1f77b4", "#d62728"), strict=True):
+        for curve, colour, side in zip(study.curves, ("#1f77b4", "#d62728"), (-13, 6), strict=True):
             shown = [row for row in rows if row.name in curve]
             x = [sum(times[row.name]) for row in shown]
             axes.plot(x, [means[row.name] for row in shown], "o-", color=colour)
             for row, at in zip(shown, x, strict=True):
                 seeds = [outcome.mean_ap() for outcome in outcomes if outcome.row.name == row.name]
                 axes.plot([at] * len(seeds), seeds, "_", color=colour, alpha=0.6)
-                axes.annotate(row.label, (at, means[row.name]), (5, 5), textcoords="offset points", fontsize=8)
+                axes.annotate(row.name, (at, means[row.name]), (5, side), textcoords="offset points", fontsize=8)
         axes.set_xlabel(f"ms a cloud on {outcomes[0].device} (dots: means, dashes: seeds)")
         axes.set_ylabel("BEV mAP, moderate (%)")
-        axes.margins(x=0.15, y=0.1)
+        axes.margins(x=0.2, y=0.1)
     else:
         for k, row in enumerate(rows):
             seeds = [outcome.mean_ap() for outcome in outcomes if outcome.row.name == row.name]
