@@ -336,18 +336,19 @@ def mark(device: torch.device) -> float:
 def agreement(outcomes: Sequence[Outcome]) -> tuple[int, int, float]:
     """Of how many pairs of rows all seeds agree which is better, of how many pairs, and how far the seeds of a row are
     apart in the median, in points of mAP."""
-    of_row: dict[str, list[float]] = {}
+    of_row: dict[str, dict[int, float]] = {}
     seen: set[Path] = set()
     for outcome in outcomes:
         if outcome.checkpoint not in seen and not math.isnan(outcome.mean_ap()):  # two rows may be one training
             seen.add(outcome.checkpoint)
-            of_row.setdefault(outcome.row.name, []).append(outcome.mean_ap())
+            of_row.setdefault(outcome.row.name, {})[outcome.seed] = outcome.mean_ap()
     alike = pairs = 0
     for a, b in itertools.combinations(of_row.values(), 2):
-        differences = [x - y for x, y in zip(a, b, strict=False)]
-        alike += min(differences) > 0 or max(differences) < 0
-        pairs += 1
-    spread = [max(values) - min(values) for values in of_row.values()]
+        differences = [a[seed] - b[seed] for seed in a.keys() & b.keys()]
+        if differences:
+            alike += min(differences) > 0 or max(differences) < 0
+            pairs += 1
+    spread = [max(values.values()) - min(values.values()) for values in of_row.values()]
     return alike, pairs, float(np.median(spread)) if spread else math.nan
 
 
@@ -377,7 +378,8 @@ def trained_table(study: Study, outcomes: Sequence[Outcome], times: dict[str, Ti
         first = first or whole
         cells = [row.label, *[shown(row.paper)] * any(row.paper for row in study.rows)]
         cells += [shown(mean_of([each.mean_ap() for each in own]))]
-        cells += [shown(each.mean_ap()) for each in own] + ["-"] * (len(seeds) - len(own))
+        of_seed = {each.seed: each.mean_ap() for each in own}
+        cells += [shown(of_seed.get(seed)) for seed in seeds]
         cells += [shown(mean_of([each.scores[name][measure][1] for each in own])) for name, measure in measures]
         cells += [shown(100 * own[0].dropped)] * limited
         cells += [shown(100 * (own[0].real_dropped or 0.0))] * (limited and real)
@@ -614,7 +616,10 @@ def train_rows(
     """Every other study: its rows, their times, and the text. The frames `real` are those of --validate."""
     device, first = select_device(options.device), next(iter(configs.values()))
     outcomes = run_rows(name, configs, data.root, data.frames, options)
-    detectors = {o.row.name: load(o.checkpoint, str(device)) for o in outcomes if o.seed == first.train.seed}
+    detectors: dict[str, Detector] = {}
+    for outcome in outcomes:  # of the first seed that there is
+        if outcome.row.name not in detectors:
+            detectors[outcome.row.name] = load(outcome.checkpoint, str(device))
     times = time_stages(detectors, data.clouds)
     fused = {row for row, detector in detectors.items() if detector.encoder.is_fused(1)}
     steps = " or ".join(map(str, sorted({outcome.steps for outcome in outcomes})))

@@ -132,6 +132,8 @@ def test_agreement_of_seeds() -> None:
     assert agreement(outcomes + shared) == (2, 3, 1.0)  # a row that is another's training is no further row
     even = [outcome(row, seed, 5.0) for seed in range(2) for row in "ab"]
     assert agreement(even) == (0, 1, 0.0)  # a tie is no order
+    assert agreement(outcomes[1:]) == (3, 3, 0.0)  # without a's first seed
+    assert agreement([outcomes[0], outcomes[4]])[:2] == (0, 0)  # no seed that both have
     empty = outcome("a", 0, 5.0)._replace(scores={"Car": {"bev": [None] * 3}})
     assert agreement([empty])[:2] == (0, 0)
 
@@ -167,6 +169,17 @@ def test_score_counts_objects_in_range(scenes: Path, tmp_path: Path) -> None:
     boxes = np.array([[x, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0] for x in (5.0, 10.0, 20.0)])
     write_labels(tmp_path / "training" / "label_2" / f"{ids[0]}.txt", boxes_to_labels(boxes, ["Car"] * 3))
     assert study.count_cars(config, tmp_path, ids[:1]) == 2  # without a camera, one of three out of range
+
+
+def test_every_seed_has_its_column() -> None:
+    rows = (Row("a", "a"), Row("b", "b"))
+    outcomes = [outcome("a", 0, 5.0), outcome("a", 1, 6.0), outcome("b", 1, 7.0)]
+    times = {"a": (1.0, 1.0, 2.0), "b": (1.0, 1.0, 0.0)}
+    table = study.trained_table(study.Study("", "", rows), outcomes, times, {"a", "b"})
+    assert table[0].startswith("| row | mAP | seed 0 | seed 1 | Car |")
+    assert table[2].startswith("| a | 5.5 | 5.0 | 6.0 | 4.5 |")
+    assert table[3].startswith("| b | 7.0 | - | 7.0 | 6.0 |")
+    assert table[3].endswith("| 0.50 |")
 
 
 @pytest.mark.parametrize(
@@ -230,10 +243,13 @@ def test_a_study_is_written_and_goes_on(
         assert picture.size[0] > 400
     files = sorted((tmp_path / "rows").glob("*/result.json"))
     assert [json.loads(file.read_text())["steps"] for file in files] == [2] * 4
-    files[0].write_text("")  # damaged: scored again from its checkpoint, which is whole; another row is left out
-    main([*arguments(tmp_path, "--data", str(scenes), "--budget", "steps=2"), "--rows", "limit-8"])
-    assert "[2/2] density/limit-8, seed 1" in capsys.readouterr().out
-    assert "| every point |" in (tmp_path / "density.md").read_text()  # of a row not named: what there is
+    for file in files:  # damaged: scored again from its checkpoint, which is whole; another row is left out
+        whole = file.read_text()
+        file.write_text("")
+        main([*arguments(tmp_path, "--data", str(scenes), "--budget", "steps=2"), "--rows", "limit-8"])
+        assert "[2/2] density/limit-8, seed 1" in capsys.readouterr().out
+        assert "| every point |" in (tmp_path / "density.md").read_text()  # of a row not named: what there is
+        file.write_text(whole)
     other = shutil.copytree(scenes, tmp_path / "elsewhere" / scenes.name)  # other data under the same name
     count = len(trained)
     main(arguments(tmp_path, "--data", str(other), "--budget", "steps=2", "--seeds", "1"))
