@@ -112,8 +112,9 @@ def _kitti_sources(root: Path, split: str | None) -> list[Source]:
     if not names:
         raise InputError(f"{root / folder / 'velodyne'}: holds no .bin file")
     sources = [Source(name, root, folder) for name in names]
+    camera = has_camera(root / folder)
     for source in sources:
-        if has_camera(root / folder) and source.kitti_file("calib", ".txt") is None:
+        if camera and source.kitti_file("calib", ".txt") is None:
             raise InputError(f"{root / folder / 'calib' / source.name}.txt: no such file; each frame wants one")
     return sources
 
@@ -277,10 +278,13 @@ def main(arguments: Sequence[str] | None) -> None:
         raise InputError("--partial: is for --split test")
     submit = options.split == "test" and not options.partial
     sources = find_sources(options.inputs, options.split)
+    for folder in sorted({source.path / source.split_dir for source in sources if source.split_dir is not None}):
+        if not has_camera(folder):
+            if submit:
+                raise InputError(f"{folder / 'calib'}: no such folder, and the KITTI server wants 2D boxes; add it")
+            print(f"{folder}: has no calib, so no camera: every point counts, and there are no 2D boxes")
     if submit:
         check_test_set([source.name for source in sources])
-        if not all(has_camera(source.path / "testing") for source in sources):
-            raise InputError("--split test: there is no testing/calib, and the KITTI server wants 2D boxes; add it")
         blind = sum(source.kitti_file("image_2", ".png") is None for source in sources)
         if blind:
             width, height = IMAGE_SIZE

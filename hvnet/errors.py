@@ -1,7 +1,7 @@
 """A page of what a detector gets wrong: `python -m hvnet.errors RUN`, one HTML file that opens from disk.
 
 It holds the evaluation of the validation split, the curves of the training, and the worst misses and false positives,
-each cut out of the camera's image and of the bird's eye view. All pictures are inside the file.
+each cut out of the bird's eye view and, with a camera, of its image. All pictures are inside the file.
 """
 
 import argparse
@@ -350,7 +350,7 @@ def main(arguments: Sequence[str] | None) -> None:
     parser = make_parser(
         "errors",
         "Writes a page (HTML, all pictures inside) of a run: its evaluation in the validation split, its curves, and "
-        "the worst misses and false positives, in the image and from above.",
+        "the worst misses and false positives, from above and, with a camera, in the image.",
         [
             "runs/demo",
             "runs/compact --data /data/kitti --count 50 --min-score 0.3",

@@ -64,7 +64,6 @@ MIN_OVERLAPS = {
         "Cyclist": {"2d": 0.5, "bev": 0.25, "3d": 0.25},
     },
 }
-NO_2D_FILTER = "hvnet.evaluate --no-2d-filter scores without"
 RECALL_STEPS = 40
 CURVE_STEPS = 200
 DISTANCES = {"0-20 m": (0, 20), "20-40 m": (20, 40), "40-60 m": (40, 60)}
@@ -104,8 +103,9 @@ def evaluate(
     candidates = find_candidates(labels, predictions)
     notes = []
     if levels is None:
-        levels = default_levels(candidates.truths if len(candidates.truths) else candidates.detections)
-        if levels == LEVELS_WITHOUT_2D:
+        levels = LEVELS
+        if not _has(candidates.truths if len(candidates.truths) else candidates.detections, "2d"):
+            levels = LEVELS_WITHOUT_2D
             notes = ["no label has a 2D box: the levels go by occlusion and truncation alone"]
     all_points = None if points is None else np.concatenate(points)
     result = {}
@@ -172,23 +172,15 @@ def _evaluate_class(
     }
 
 
-def default_levels(objects: Labels) -> tuple[Level, ...]:
-    """KITTI's levels, without their least height in the image where none of the objects has a 2D box."""
-    return LEVELS if _has(objects, "2d") else LEVELS_WITHOUT_2D
-
-
 def _has(labels: Labels, metric: str) -> bool:
     """Whether boxes of this kind are given: at least once, as in the devkit, or nothing is given at all."""
-    return bool(_given(labels, metric).any()) or not len(labels)
-
-
-def _given(labels: Labels, metric: str) -> Mask:
-    """Which rows have a box of this kind: (K,)."""
     if metric == "2d":
-        return (labels.bbox[:, 0] >= 0) & (labels.bbox[:, 2:] > labels.bbox[:, :2]).all(axis=1)
-    if metric == "bev":
-        return (labels.location[:, [0, 2]] != -1000).all(axis=1) & (labels.dimensions[:, 1:] > 0).all(axis=1)
-    return (labels.location != -1000).all(axis=1) & (labels.dimensions > 0).all(axis=1)
+        given = (labels.bbox[:, 0] >= 0) & (labels.bbox[:, 2:] > labels.bbox[:, :2]).all(axis=1)
+    elif metric == "bev":
+        given = (labels.location[:, [0, 2]] != -1000).all(axis=1) & (labels.dimensions[:, 1:] > 0).all(axis=1)
+    else:
+        given = (labels.location != -1000).all(axis=1) & (labels.dimensions > 0).all(axis=1)
+    return bool(given.any()) or not len(labels)
 
 
 def _samples(matching: Matching, counts: Counts, scores: Floats) -> Integers:
@@ -275,12 +267,11 @@ def _warnings(truths: Labels, detections: Labels, levels: Sequence[Level], count
     if any(level.min_height > 0 for level in levels):
         for objects, kind in ((truths, "label"), (detections, "detection")):
             if len(objects) and not _has(objects, "2d"):
-                warnings.append(f"no {kind} has a 2D box, which these levels ask for: {NO_2D_FILTER}")
-        without = int((~_given(truths, "2d")).sum())
-        if 0 < without < len(truths):
-            warnings.append(
-                f"{without} of {len(truths)} labels have no 2D box, which these levels ask for: {NO_2D_FILTER}"
-            )
+                warnings.append(f"no {kind} has a 2D box, as these levels ask: see hvnet.evaluate --no-2d-filter")
+        flat = int((truths.bbox[:, 3] <= truths.bbox[:, 1]).sum())
+        if 0 < flat < len(truths):
+            of = f"{flat} of {len(truths)} labels have"
+            warnings.append(f"{of} no 2D box, as these levels ask: see hvnet.evaluate --no-2d-filter")
     for level, total in zip(levels, counts, strict=True):
         if 0 < total <= RECALL_STEPS:
             # one threshold a ground truth at most, the first of which stands at recall 0

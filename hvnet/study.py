@@ -30,9 +30,8 @@ from hvnet.cli import InputError, add_changes, add_device, make_parser, run_comm
 from hvnet.config import Config, SyntheticConfig, config_to_dict, load_config
 from hvnet.data.kitti import Frame, Labels, detections_to_labels, read_frame, read_split
 from hvnet.detector import Detector, load
-from hvnet.evaluate import CLASSES, default_levels, evaluate
+from hvnet.evaluate import CLASSES, evaluate
 from hvnet.kernels.voxel import make_grid
-from hvnet.matching import select_truths
 from hvnet.model import HVNet, device_name, select_device
 from hvnet.pillars import hard_voxels
 from hvnet.train import caught_signals, check_classes, generated_scenes, train
@@ -221,7 +220,8 @@ def labels_in_range(frame: Frame, config: Config) -> Labels:
 def count_cars(config: Config, root: Path, ids: Sequence[str]) -> int:
     """The moderate cars in range: one of them is so many times less than 100 points of recall."""
     labels = [labels_in_range(read_frame(root, name), config) for name in ids]
-    return sum(int(select_truths(each, "Car", default_levels(each)[1]).sum()) for each in labels)
+    nothing = [Labels(**{**vars(each.select(np.zeros(0, np.int64))), "score": np.zeros(0)}) for each in labels]
+    return evaluate(labels, nothing, classes=["Car"])["Car"]["counts"]["ground_truths"][1]
 
 
 def dropped_share(config: Config, root: Path, ids: Sequence[str]) -> float:

@@ -17,7 +17,7 @@ from hvnet.data.database import (
     read_database,
     write_database,
 )
-from hvnet.data.kitti import Calibration, read_split, write_calibration, write_points
+from hvnet.data.kitti import Calibration, read_points, read_split, write_calibration, write_points
 
 # a camera at the LiDAR's origin that looks along +x
 CALIB = Calibration(
@@ -164,6 +164,17 @@ def test_a_frame_that_is_no_number_is_named(root: Path) -> None:
     write_frame(root, "street", OBJECTS)
     with pytest.raises(InputError, match=re.escape(f"{root}: frame 'street' is no number")):
         build_database(root, read_split(root, "train"))
+
+
+@pytest.mark.parametrize("scale", [255, -1])
+def test_reflectance_of_another_scale_is_refused(root: Path, scale: int) -> None:
+    path = root / "training" / "velodyne" / "000003.bin"
+    points = read_points(path)
+    points[:, 3] *= scale
+    write_points(path, points)
+    with pytest.raises(InputError, match=re.escape(f"frame 000003 of {root}: the object of label row")) as raised:
+        build_database(root, ["000003"])
+    assert "want 0 to 1; divide the clouds' by their scale, such as 255" in str(raised.value)
 
 
 def test_a_split_without_objects_is_named(tmp_path: Path) -> None:

@@ -297,7 +297,7 @@ def test_a_submission_wants_2d_boxes(checkpoint: Path, test_set: Path, tmp_path:
     with pytest.raises(InputError, match=r"testing.calib: no such folder, but there is image_2; add the calibrations"):
         detect(checkpoint, tmp_path / "out", test_set, options=("--split", "test"))
     shutil.rmtree(test_set / "testing" / "image_2")
-    with pytest.raises(InputError, match=r"--split test: there is no testing/calib"):
+    with pytest.raises(InputError, match=r"testing.calib: no such folder, and the KITTI server wants 2D boxes; add it"):
         detect(checkpoint, tmp_path / "out", test_set, options=("--split", "test"))
     detect(checkpoint, tmp_path / "out", test_set, options=("--split", "test", "--partial"))  # as of a LiDAR alone
     assert (read_labels(tmp_path / "out" / "results" / "000000.txt", scored=True).bbox == -1).all()

@@ -176,7 +176,9 @@ def test_own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     given = ["--checkpoint", "run/checkpoint.pt", "--device", "cpu"]
     capsys.readouterr()
     detect.main(["mine", "--split", "val", *given])
-    assert re.search(r"^\d+ boxes in 1 cloud$", capsys.readouterr().out, flags=re.MULTILINE)
+    printed = capsys.readouterr().out
+    assert re.search(r"^\d+ boxes in 1 cloud$", printed, flags=re.MULTILINE)
+    assert "mine/training: has no calib, so no camera: every point counts, and there are no 2D boxes" in printed
     found = read_labels(tmp_path / "detections" / "results" / "000004.txt", scored=True)
     assert (found.location[:, 2] < 0).any()  # behind
     assert (found.bbox == -1).all()

@@ -426,7 +426,7 @@ def lidar_alone(root: Path) -> Path:
         (folder / name).mkdir(parents=True)
     (root / "ImageSets").mkdir()
     (root / "ImageSets" / "val.txt").write_text("000000\n")
-    points = np.random.default_rng(0).uniform(-20, 20, (100, 4)).astype(np.float32)
+    points = np.random.default_rng(0).uniform((-20, -20, -2, 0), (20, 20, 1, 1), (100, 4)).astype(np.float32)
     write_points(folder / "velodyne" / "000000.bin", points)
     write_labels(folder / "label_2" / "000000.txt", boxes_to_labels(BOXES, ["Car", "Cyclist"]))
     return root
@@ -472,5 +472,6 @@ def test_labels_of_boxes_with_a_camera() -> None:
     np.testing.assert_allclose(labels.bbox, project_boxes(BOXES[:1], PLAIN, SIZE)[0])
     np.testing.assert_allclose(boxes_to_lidar(labels, PLAIN), BOXES[:1])
     assert (labels.truncation.tolist(), labels.occlusion.tolist(), labels.score) == ([0.0], [0], None)
-    with pytest.raises(ValueError, match="image_size: want that of the calibration's camera"):
-        boxes_to_labels(BOXES, ["Car", "Cyclist"], PLAIN)
+    for camera in ({"calib": PLAIN}, {"image_size": SIZE}):
+        with pytest.raises(ValueError, match="want a calibration and the size of its image, or neither"):
+            boxes_to_labels(BOXES, ["Car", "Cyclist"], **camera)

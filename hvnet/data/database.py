@@ -102,6 +102,9 @@ def build_database(root: Path, names: Sequence[str]) -> Database:
             xyz_mm = (points[:, :3] * 1000).round() - centre
             if len(points) and xyz_mm.abs().max() > np.iinfo(np.int16).max:
                 raise InputError(f"frame {frame_id} of {root}: the object of label row {row} is over 65 m long")
+            if ((points[:, 3] < 0) | (points[:, 3] > 1)).any():
+                what = f"the object of label row {row} has reflectances to {points[:, 3].abs().max():g}, want 0 to 1"
+                raise InputError(f"frame {frame_id} of {root}: {what}; divide the clouds' by their scale, such as 255")
             columns["xyz_mm"].append(xyz_mm.T.numpy())
             columns["reflectance"].append((points[:, 3] * 100).round().numpy())
             counts.append(len(points))

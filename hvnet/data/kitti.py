@@ -143,7 +143,7 @@ def read_frame(
     folder = Path(root) / split_dir
     labels = read_labels(folder / "label_2" / f"{frame_id}.txt") if labelled else _labels([])
     calib = frame_calibration(folder, frame_id, labels)
-    image_size = _image_size(folder / "image_2" / f"{frame_id}.png") if has_camera(folder) else NO_IMAGE
+    image_size = NO_IMAGE if calib is AT_LIDAR else _image_size(folder / "image_2" / f"{frame_id}.png")
     points, dropped = drop_non_finite(read_points(folder / "velodyne" / f"{frame_id}.bin"))
     if crop:
         points = points[in_image(points, calib, image_size)]
@@ -422,10 +422,11 @@ def boxes_to_labels(
     """The rows of a label file for boxes (M, 7) and their classes, or with scores (M,) of a result file: K <= M.
 
     Labels are neither truncated nor occluded; of results nothing is known about that. A box with nothing in the image
-    is left out: nothing is labelled there. Raises ValueError for a calibration without the size of its image.
+    is left out: nothing is labelled there. Raises ValueError for a calibration without the size of its image, or a size
+    alone.
     """
-    if image_size == NO_IMAGE and calib is not AT_LIDAR:
-        raise ValueError("image_size: want that of the calibration's camera, got none")
+    if (image_size == NO_IMAGE) != np.array_equal(calib.p2, AT_LIDAR.p2):
+        raise ValueError(f"image_size {image_size}: want a calibration and the size of its image, or neither")
     bbox, visible = project_boxes(boxes, calib, image_size)
     dimensions, location, rotation_y = boxes_to_camera(boxes, calib)
     rating = 0 if scores is None else -1
