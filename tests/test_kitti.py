@@ -14,6 +14,7 @@ from PIL import Image
 from hvnet.boxes import points_in_boxes
 from hvnet.cli import InputError
 from hvnet.data.kitti import (
+    AT_LIDAR,
     NO_IMAGE,
     Calibration,
     Labels,
@@ -475,3 +476,5 @@ def test_labels_of_boxes_with_a_camera() -> None:
     for camera in ({"calib": PLAIN}, {"image_size": SIZE}):
         with pytest.raises(ValueError, match="want a calibration and the size of its image, or neither"):
             boxes_to_labels(BOXES, ["Car", "Cyclist"], **camera)
+    read = dataclasses.replace(AT_LIDAR)  # what a file may hold, for want of a camera
+    assert len(boxes_to_labels(BOXES, ["Car", "Cyclist"], read, SIZE)) < 2

@@ -425,7 +425,7 @@ def boxes_to_labels(
     is left out: nothing is labelled there. Raises ValueError for a calibration without the size of its image, or a size
     alone.
     """
-    if (image_size == NO_IMAGE) != np.array_equal(calib.p2, AT_LIDAR.p2):
+    if (image_size == NO_IMAGE) != (calib is AT_LIDAR):  # a file may hold the same numbers, with an image
         raise ValueError(f"image_size {image_size}: want a calibration and the size of its image, or neither")
     bbox, visible = project_boxes(boxes, calib, image_size)
     dimensions, location, rotation_y = boxes_to_camera(boxes, calib)
