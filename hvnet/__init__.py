@@ -8,7 +8,7 @@ from typing import Any
 
 def __getattr__(name: str) -> Any:
     if name in ("load", "Detector"):  # on first use: who wants the kernels alone need not import the network
-        from hvnet import detector
+        from hvnet.network import detector
 
         return getattr(detector, name)
     raise AttributeError(f"module 'hvnet' has no attribute {name!r}")

@@ -5,7 +5,7 @@ COMMANDS = {
     "train": "train and validate; without arguments the demo, on generated scenes",
     "evaluate": "score KITTI result files of any detector",
     "figures": "draw clouds, labels, detections and pseudo-images",
-    "errors": "a page of the worst misses and false positives",
+    "mistakes": "a page of the worst misses and false positives",
     "view": "look at clouds, labels and mistakes in the browser",
     "export": "write ONNX and torch.export files for other programs",
     "study": "rerun the paper's tables and figures",

@@ -5,8 +5,12 @@ z is the height of the box's centre; yaw turns about +z, is 0 along +x and lies 
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
+
+# pairs of corners, in the order of box_corners: four edges at the bottom, four at the top, four between them
+EDGES = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]])
 
 
 def limit_angle(angle: Tensor) -> Tensor:

@@ -1,14 +1,13 @@
-"""What every command shares: its parser, the error a user can mend, and how it ends."""
+"""What every command shares: its parser, common options, and how it ends."""
 
 import argparse
+import math
 import sys
 import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-
-class InputError(ValueError):
-    """A mistake in what the user gave; the message names the file, the place and the remedy."""
+from hvnet.exceptions import InputError, Stopped
 
 
 def make_parser(command: str, description: str, examples: Sequence[str]) -> argparse.ArgumentParser:
@@ -18,6 +17,16 @@ def make_parser(command: str, description: str, examples: Sequence[str]) -> argp
         description=textwrap.fill(description, 98),
         epilog="\n".join(["examples:", *(f"  python -m hvnet.{command} {example}".rstrip() for example in examples)]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def add_inputs(parser: argparse.ArgumentParser, suffixes: Sequence[str]) -> None:
+    """The clouds that a command reads: INPUT and the option --split; `suffixes` are those of the files it knows."""
+    parser.add_argument(
+        "inputs", nargs="+", type=Path, metavar="INPUT", help=f"files ({', '.join(suffixes)}), folders, KITTI roots"
+    )
+    parser.add_argument(
+        "--split", metavar="NAME", help="frames of ImageSets/NAME.txt of a KITTI root (default: all frames)"
     )
 
 
@@ -33,24 +42,51 @@ def add_checkpoint(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_overlaps(parser: argparse.ArgumentParser) -> None:
+    """The option --overlap, a list of CLASS=VALUE; see `read_overlaps`."""
+    parser.add_argument(
+        "--overlap",
+        action="append",
+        default=[],
+        metavar="CLASS=X",
+        help="overlap that a detection of a class needs (default: KITTI's; else by size, 0.7 from 3 m on, 0.5 below)",
+    )
+
+
+def read_overlaps(given: Sequence[str], classes: Sequence[str]) -> dict[str, float]:
+    """The values of --overlap by class. Raises InputError for a class that is not there, or no overlap."""
+    overlaps = {}
+    for text in given:
+        name, _, number = text.rpartition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            value = math.nan
+        if not name or not 0 < value <= 1:
+            raise InputError(f"--overlap {text}: want CLASS=X with X above 0 and at most 1, such as Truck=0.5")
+        if name not in classes:
+            raise InputError(f"--overlap {text}: no class {name}; there are {', '.join(classes)}")
+        overlaps[name] = value
+    return overlaps
+
+
 def add_changes(parser: argparse.ArgumentParser, what: str) -> None:
     """The option --set, a list of changes; `what` is its help."""
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=what)
 
 
-def check_empty(out: Path, remedy: str = "give another --out") -> None:
-    """Raises InputError unless `out` is an empty folder or does not exist."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out}: is not empty; {remedy}")
-
-
 def run_command(main: Callable[[Sequence[str] | None], None]) -> None:
-    """Runs a command's main: a user's mistake, or a file that fails, ends it with one line and exit code 2."""
+    """Runs a command's main: a user's mistake, or a file that fails, ends it with one line and exit code 2,
+    a signal with 128 and its number."""
     try:
         main(None)
     except (InputError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+    except Stopped as stop:
+        if str(stop):  # the first of several ranks speaks
+            print(stop, flush=True)
+        sys.exit(128 + stop.signal)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)

@@ -13,12 +13,12 @@ from typing import Any, Literal
 
 import yaml
 
-from hvnet.cli import InputError
+from hvnet.exceptions import InputError
 
-MOST_CELLS = 2**26
+MAX_CELLS = 2**26
 """Of the finest pseudo-image: 8192 x 8192, with 32 channels 8 GiB a sample."""
-MOST_CHANNELS = 4096
-MOST_LAYERS = 200
+MAX_CHANNELS = 4096
+MAX_LAYERS = 200
 """Of a block; beyond these a config is taken for a mistake before it takes all memory."""
 
 
@@ -63,6 +63,7 @@ class ClassConfig:
     focal_alpha: float
     focal_gamma: float
     nms_iou: float
+    overlap: float | None = None  # with a label that a detection has to reach in the evaluation; default: by size
 
 
 @dataclass(frozen=True)
@@ -152,25 +153,27 @@ class Config:
     synthetic: SyntheticConfig | None = None
 
 
-def load_config(path: str | Path, overrides: Sequence[str] = (), instead: tuple[Path, Path] | None = None) -> Config:
+def load_config(
+    path: str | Path, overrides: Sequence[str] = (), replace_base: tuple[Path, Path] | None = None
+) -> Config:
     """Reads a YAML file and applies overrides such as "train.epochs=3".
 
     A file with a key `base`, the path of another file from its own folder, holds only the differences to that one. They
     are laid over it: mappings key by key; over the list of classes goes a mapping by their names; null takes a key or
-    a class away. With `instead`, (file, other), the other takes the file's place among the bases.
+    a class away. With `replace_base`, (file, other), the other takes the file's place among the bases.
 
     Raises InputError naming file and key.
     """
-    tree = _read_chain(Path(path), instead, ())
+    tree = _read_chain(Path(path), replace_base, ())
     for override in overrides:
         _override(tree, override)
     return config_from_dict(tree, str(path))
 
 
-def _read_chain(path: Path, instead: tuple[Path, Path] | None, seen: tuple[Path, ...]) -> dict[str, Any]:
+def _read_chain(path: Path, replace_base: tuple[Path, Path] | None, seen: tuple[Path, ...]) -> dict[str, Any]:
     """The tree of a file, laid over that of its base."""
-    if instead is not None and path.resolve() == instead[0].resolve():
-        return _read_chain(instead[1], None, ())
+    if replace_base is not None and path.resolve() == replace_base[0].resolve():
+        return _read_chain(replace_base[1], None, ())
     if path.resolve() in seen:
         raise InputError(f"{path}: base: is its own base; name another file")
     try:
@@ -188,10 +191,10 @@ def _read_chain(path: Path, instead: tuple[Path, Path] | None, seen: tuple[Path,
     below = tree.pop("base")
     if not isinstance(below, str):
         raise InputError(f"{path}: base: want the path of a YAML file, got {below!r}")
-    return _laid_over(_read_chain(path.parent / below, instead, (*seen, path.resolve())), tree, str(path), "")
+    return _merge(_read_chain(path.parent / below, replace_base, (*seen, path.resolve())), tree, str(path), "")
 
 
-def _laid_over(below: Any, above: Any, source: str, key: str) -> Any:
+def _merge(below: Any, above: Any, source: str, key: str) -> Any:
     """The value `above` laid over the value `below` of a dotted key."""
     if not isinstance(above, dict):
         return above
@@ -200,13 +203,13 @@ def _laid_over(below: Any, above: Any, source: str, key: str) -> Any:
         unknown = [str(name) for name in above if name not in named]
         if unknown:
             raise InputError(f"{source}: {key}.{unknown[0]}: no such entry below; known: {', '.join(named)}")
-        return list(_laid_over(named, above, source, key).values())
+        return list(_merge(named, above, source, key).values())
     made = dict(below) if isinstance(below, dict) else {}
     for name, value in above.items():
         if value is None:
             made.pop(name, None)
         else:
-            made[name] = _laid_over(made.get(name), value, source, f"{key}.{name}" if key else str(name))
+            made[name] = _merge(made.get(name), value, source, f"{key}.{name}" if key else str(name))
     return made
 
 
@@ -316,7 +319,7 @@ def _build(kind: Any, value: Any, key: str, source: str) -> Any:
 
 
 def _check(config: Config, source: str) -> None:
-    """Refuses values that no run can have."""
+    """Rejects invalid values."""
 
     def want(holds: bool, key: str, wanted: str, got: object) -> None:
         if not holds:
@@ -334,15 +337,13 @@ def _check(config: Config, source: str) -> None:
     for r, (fine, coarse) in enumerate(zip(encoder.projection_scales, encoder.projection_scales[1:], strict=False)):
         want(coarse == 2 * fine, f"encoder.projection_scales[{r + 1}]", f"twice the scale before, {2 * fine}", coarse)
     for key in ("feature_channels", "image_channels"):
-        want(
-            0 < getattr(encoder, key) <= MOST_CHANNELS, f"encoder.{key}", f"1 to {MOST_CHANNELS}", getattr(encoder, key)
-        )
+        want(0 < getattr(encoder, key) <= MAX_CHANNELS, f"encoder.{key}", f"1 to {MAX_CHANNELS}", getattr(encoder, key))
     finest = [v * encoder.projection_scales[0] for v in encoder.voxel_size]
     cells = math.prod((b - a) / v for a, b, v in zip(low, high, finest, strict=False))
     want(
-        cells <= MOST_CELLS,
+        cells <= MAX_CELLS,
         "encoder.voxel_size",
-        f"at most {MOST_CELLS} cells in the finest projection",
+        f"at most {MAX_CELLS} cells in the finest projection",
         f"{cells:.3g}",
     )
     for key in ("point_limit", "voxel_limit"):
@@ -355,7 +356,7 @@ def _check(config: Config, source: str) -> None:
         for key in ("point_limit", "voxel_limit"):
             want(getattr(encoder, key) > 0, f"encoder.{key}", "1 or more for pillars", getattr(encoder, key))
         padded = encoder.point_limit * encoder.voxel_limit
-        want(padded <= MOST_CELLS, "encoder.voxel_limit", f"at most {MOST_CELLS} places of points in pillars", padded)
+        want(padded <= MAX_CELLS, "encoder.voxel_limit", f"at most {MAX_CELLS} places of points in pillars", padded)
     blocks = max(3, len(encoder.projection_scales))
     want(backbone.stride in (1, 2), "backbone.stride", "1 or 2", backbone.stride)
     want(backbone.stride == 1 or len(encoder.projection_scales) == 1, "backbone.stride",
@@ -364,14 +365,14 @@ def _check(config: Config, source: str) -> None:
         values = getattr(backbone, key)
         wanted = "3 values" if blocks == 3 else f"3 to {blocks} values"
         want(3 <= len(values) <= blocks, f"backbone.{key}", f"{wanted}, one a block", list(values))
-    in_reach = min(backbone.widths) > 0 and max(backbone.widths) <= MOST_CHANNELS
-    want(in_reach, "backbone.widths", f"values from 1 to {MOST_CHANNELS}", list(backbone.widths))
-    want(max(backbone.layers) <= MOST_LAYERS, "backbone.layers", f"{MOST_LAYERS} or fewer", list(backbone.layers))
+    in_reach = min(backbone.widths) > 0 and max(backbone.widths) <= MAX_CHANNELS
+    want(in_reach, "backbone.widths", f"values from 1 to {MAX_CHANNELS}", list(backbone.widths))
+    want(max(backbone.layers) <= MAX_LAYERS, "backbone.layers", f"{MAX_LAYERS} or fewer", list(backbone.layers))
     want(
         min(backbone.layers) > 1, "backbone.layers", "2 or more (an image joins after the first)", list(backbone.layers)
     )
     fusion = backbone.fusion_channels
-    want(0 < fusion <= MOST_CHANNELS, "backbone.fusion_channels", f"1 to {MOST_CHANNELS}", fusion)
+    want(0 < fusion <= MAX_CHANNELS, "backbone.fusion_channels", f"1 to {MAX_CHANNELS}", fusion)
     want(len(head.classes) > 0, "head.classes", "at least one class", [])
     names = [entry.name for entry in head.classes]
     want(len(set(names)) == len(names), "head.classes", "no class twice", names)
@@ -388,6 +389,10 @@ def _check(config: Config, source: str) -> None:
         want(0 <= entry.focal_alpha <= 1, f"{key}.focal_alpha", "between 0 and 1", entry.focal_alpha)
         want(entry.focal_gamma >= 0, f"{key}.focal_gamma", "0 or more", entry.focal_gamma)
         want(0 <= entry.nms_iou <= 1, f"{key}.nms_iou", "between 0 and 1", entry.nms_iou)
+        named = entry.name.split() == [entry.name] and entry.name != "DontCare"
+        want(named, f"{key}.name", "a word, as in the label files, but not DontCare", repr(entry.name))
+        in_reach = entry.overlap is None or 0 < entry.overlap <= 1
+        want(in_reach, f"{key}.overlap", "above 0 and at most 1", entry.overlap)
     want(0 <= head.score_threshold < 1, "head.score_threshold", "at least 0 and below 1", head.score_threshold)
     for key in ("candidates", "detections"):
         want(getattr(head, key) > 0, f"head.{key}", "1 or more", getattr(head, key))

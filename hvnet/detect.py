@@ -4,119 +4,43 @@
 test set in its root (the readme of KITTI's object devkit), checked line by line before it is written.
 """
 
-import argparse
 import csv
 import math
+import textwrap
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 from tqdm import tqdm
 
-from hvnet.cli import InputError, add_checkpoint, add_device, check_empty, make_parser, run_command
-from hvnet.data.clouds import SUFFIXES, read_cloud
-from hvnet.data.kitti import (
-    AT_LIDAR,
-    IMAGE_SIZE,
-    NO_IMAGE,
-    Calibration,
-    Labels,
-    detections_to_labels,
-    has_camera,
-    read_frame,
-    read_labels,
-    read_split,
-    write_labels,
+from hvnet.cli import (
+    add_checkpoint,
+    add_device,
+    add_inputs,
+    add_overlaps,
+    make_parser,
+    read_overlaps,
+    run_command,
 )
-from hvnet.detector import Detector, load
-from hvnet.draw import Camera, Subject, camera_at, draw_bev, draw_frame
-from hvnet.evaluate import CLASSES, evaluate, format_table
-from hvnet.model import Detections
+from hvnet.data.clouds import SUFFIXES
+from hvnet.data.frame import IMAGE_SIZE, Frame, Frames
+from hvnet.data.kitti import KittiFrames, frame_labels, has_camera, read_labels, write_labels
+from hvnet.data.labels import Labels
+from hvnet.data.sources import find_frames
+from hvnet.evaluation.precision import evaluate
+from hvnet.evaluation.rules import KITTI, config_rules
+from hvnet.evaluation.scoring import background_note, detect_frames
+from hvnet.evaluation.tables import format_table
+from hvnet.exceptions import InputError
+from hvnet.folders import check_empty
+from hvnet.network.detector import Detector, load
+from hvnet.network.model import Detections
+from hvnet.pictures.clouds import Subject, draw_bev, draw_frame
 
 TEST_FRAMES = 7518
 """Frames 000000 to 007517 are KITTI's test set; its server rejects results with fewer."""
-
-
-class Source(NamedTuple):
-    """One cloud: a file, or a frame of a KITTI root."""
-
-    name: str
-    path: Path  # the file, or the root
-    split_dir: str | None  # training or testing for a frame of a KITTI root
-
-    def kitti_file(self, folder: str, suffix: str) -> Path | None:
-        """The frame's file in a folder of its KITTI root, None if there is none."""
-        path = self.path / (self.split_dir or "") / folder / (self.name + suffix)
-        return path if self.split_dir is not None and path.is_file() else None
-
-
-class Cloud(NamedTuple):
-    """What a source holds."""
-
-    points: Tensor  # (N, 4)
-    truth: Tensor  # (T, 7), none where there are no labels
-    calib: Calibration
-    image_size: tuple[int, int]  # NO_IMAGE without a camera
-    notes: list[str]
-
-
-def add_inputs(parser: argparse.ArgumentParser) -> None:
-    """The clouds that `find_sources` looks for: INPUT and the option --split."""
-    parser.add_argument(
-        "inputs", nargs="+", type=Path, metavar="INPUT", help=f"files ({', '.join(SUFFIXES)}), folders, KITTI roots"
-    )
-    parser.add_argument(
-        "--split", metavar="NAME", help="frames of ImageSets/NAME.txt of a KITTI root (default: all frames)"
-    )
-
-
-def find_sources(inputs: Sequence[Path], split: str | None) -> list[Source]:
-    """The clouds of the inputs, in order. Raises InputError for one that is missing or empty, or a name used twice."""
-    sources: list[Source] = []
-    for path in inputs:
-        if path.is_file():
-            if path.suffix not in SUFFIXES:
-                raise InputError(f"{path}: unknown kind of file; known: {', '.join(SUFFIXES)}")
-            sources.append(Source(path.stem, path, None))
-        elif (path / "training").is_dir() or (path / "testing").is_dir():
-            sources += _kitti_sources(path, split)
-        elif path.is_dir():
-            files = sorted(file for file in path.iterdir() if file.suffix in SUFFIXES)
-            if not files:
-                raise InputError(f"{path}: holds no cloud ({', '.join(SUFFIXES)}) and is no KITTI root")
-            sources += [Source(file.stem, file, None) for file in files]
-        else:
-            raise InputError(f"{path}: no such file or folder")
-    if split is not None and all(source.split_dir is None for source in sources):
-        raise InputError(f"--split {split}: none of the inputs is a KITTI root")
-    first: dict[str, Source] = {}
-    for source in sources:
-        if source.name in first:
-            raise InputError(f"{source.path}: the name {source.name} is taken by {first[source.name].path}; rename one")
-        first[source.name] = source
-    return sources
-
-
-def _kitti_sources(root: Path, split: str | None) -> list[Source]:
-    folder = "testing" if split == "test" or not (root / "training").is_dir() else "training"
-    # the test set is all of its folder, and KITTI's own download names its frames nowhere
-    if split is not None and (split != "test" or (root / "ImageSets" / "test.txt").is_file()):
-        names = read_split(root, split, split_dir=folder, labelled=False)
-        return [Source(name, root, folder) for name in names]
-    names = sorted(file.stem for file in (root / folder / "velodyne").glob("*.bin"))
-    if not names:
-        raise InputError(f"{root / folder / 'velodyne'}: holds no .bin file")
-    sources = [Source(name, root, folder) for name in names]
-    camera = has_camera(root / folder)
-    for source in sources:
-        if camera and source.kitti_file("calib", ".txt") is None:
-            raise InputError(f"{root / folder / 'calib' / source.name}.txt: no such file; each frame wants one")
-    return sources
 
 
 def check_test_set(names: Sequence[str]) -> None:
@@ -131,30 +55,12 @@ def check_test_set(names: Sequence[str]) -> None:
         )
 
 
-def read_source(source: Source, classes: Sequence[str]) -> Cloud:
-    """Reads a source; a KITTI frame comes with its calibration, if any, and, where there are labels, the true boxes."""
-    if source.split_dir is None:
-        points, notes = read_cloud(source.path)
-        return Cloud(torch.from_numpy(points), torch.zeros(0, 7), AT_LIDAR, NO_IMAGE, notes)
-    labelled = source.kitti_file("label_2", ".txt") is not None
-    frame = read_frame(source.path, source.name, source.split_dir, labelled=labelled)
-    truth = frame.boxes[[name in classes for name in frame.names]]
-    return Cloud(frame.points, truth, frame.calib, frame.image_size, [frame.note] if frame.note else [])
+def result_rows(rows: Labels, frame: Frame) -> Labels:
+    """The rows of a result file: of a box with less than 0.01 pixels in the image nothing is reported.
 
-
-def camera_of(source: Source, cloud: Cloud) -> Camera | None:
-    """The camera of a cloud with its image, where there is one; None without a camera."""
-    return camera_at(cloud.calib, cloud.image_size, source.kitti_file("image_2", ".png"))
-
-
-def result_rows(found: Detections, cloud: Cloud, classes: Sequence[str]) -> Labels:
-    """The rows of a KITTI result file. Without a camera the 2D boxes are -1, and the axes those of AT_LIDAR.
-
-    Of a box with less than 0.01 pixels in the image nothing is reported: rounded it would have no area.
+    Rounded it would have no area. Without a camera there are no 2D boxes.
     """
-    names = [classes[label] for label in found.labels.tolist()]
-    rows = detections_to_labels(found.boxes, found.scores, names, cloud.calib, cloud.image_size)
-    if cloud.image_size == NO_IMAGE:
+    if frame.camera is None:
         return rows
     size = rows.bbox[:, 2:] - rows.bbox[:, :2]
     return rows.select(size.min(axis=1) >= 0.01)
@@ -170,7 +76,7 @@ def submission_rows(rows: Labels) -> Labels:
     """The rows that the KITTI server scores: of its classes, with angles that stay in [-pi, pi] when rounded."""
     limit = 3.1415
     rows = replace(rows, alpha=rows.alpha.clip(-limit, limit), rotation_y=rows.rotation_y.clip(-limit, limit))
-    return rows.select(np.isin(rows.name, CLASSES))
+    return rows.select(np.isin(rows.name, [*KITTI]))
 
 
 def check_results(path: Path, image_size: tuple[int, int]) -> None:
@@ -178,7 +84,7 @@ def check_results(path: Path, image_size: tuple[int, int]) -> None:
     rows = read_labels(path, scored=True)  # 16 fields, all numbers finite, a known class
     angles = np.abs(np.column_stack((rows.alpha, rows.rotation_y)))
     wrong = {
-        "a class that is not scored": ~np.isin(rows.name, CLASSES),
+        "a class that is not scored": ~np.isin(rows.name, [*KITTI]),
         "a 2D box without area": (rows.bbox[:, 2:] <= rows.bbox[:, :2]).any(axis=1),
         "a 2D box outside the image": ((rows.bbox < 0) | (rows.bbox > np.tile(image_size, 2) - 1)).any(axis=1),
         "a 3D box without volume": (rows.dimensions <= 0).any(axis=1),
@@ -196,50 +102,39 @@ def write_submission(path: Path, results: Path) -> None:
             archive.writestr(zipfile.ZipInfo(file.name), file.read_bytes(), zipfile.ZIP_DEFLATED)
 
 
-def score_results(sources: Sequence[Source], results: Path, classes: Sequence[str]) -> str | None:
-    """The table of `hvnet.evaluate` for the result files, None unless every source is a frame with labels."""
-    label_files = [file for source in sources if (file := source.kitti_file("label_2", ".txt")) is not None]
-    scored = [name for name in CLASSES if name in classes]
-    if len(label_files) < len(sources) or not scored:
-        return None
-    labels = [read_labels(file) for file in label_files]
-    predictions = [read_labels(results / f"{source.name}.txt", scored=True) for source in sources]
-    return format_table(evaluate(labels, predictions, classes=scored))
+def detect(
+    detector: Detector, frames: Frames, out: Path, pictures: int, submit: bool = False
+) -> tuple[int, list[Labels]]:
+    """Writes results/NAME.txt, boxes.csv and the first few pictures/NAME.png.
 
-
-def detect(detector: Detector, sources: Sequence[Source], out: Path, pictures: int, submit: bool = False) -> int:
-    """Writes results/NAME.txt, boxes.csv and the first few pictures/NAME.png; returns the number of boxes.
-
-    With `submit` the results are made and checked for the KITTI server, and submission.zip is written last.
+    Returns the number of boxes, and the labels of those frames that have any. With `submit` the results are made and
+    checked for the KITTI server, and submission.zip is written last.
     """
-    total = 0
-    for k, source in enumerate(tqdm(sources, desc="detecting", unit="cloud", dynamic_ncols=True)):
-        cloud = read_source(source, detector.classes)
-        for note in cloud.notes:
-            tqdm.write(note)
-        found = detector(cloud.points)
+    total, truths = 0, []
+    point_range = detector.config.encoder.point_range
+    bar = tqdm(range(len(frames)), desc="detecting", unit="cloud", dynamic_ncols=True)
+    for k, frame, found, every in detect_frames(detector, frames, bar):
         (out / "results").mkdir(parents=True, exist_ok=True)  # not before the first cloud is read
-        rows, result_file = result_rows(found, cloud, detector.classes), out / "results" / f"{source.name}.txt"
+        rows, result_file = result_rows(every, frame), out / "results" / f"{frame.name}.txt"
         write_labels(result_file, submission_rows(rows) if submit else rows)
         if submit:
-            check_results(result_file, cloud.image_size)
+            check_results(result_file, frame.camera.size if frame.camera else IMAGE_SIZE)
         with (out / "boxes.csv").open("a", newline="", encoding="utf-8") as file:
             table = csv.writer(file)
             if k == 0:
                 table.writerow(["cloud", "class", "score", "x", "y", "z", "length", "width", "height", "yaw"])
-            table.writerows(csv_rows(source.name, found, detector.classes))
+            table.writerows(csv_rows(frame.name, found, detector.classes))
         if k < pictures:
-            path, point_range = out / "pictures" / f"{source.name}.png", detector.config.encoder.point_range
-            subject = Subject(cloud.points, cloud.truth, *found, detector.classes)
-            camera = camera_of(source, cloud)
-            if camera is not None and camera.image is not None:
-                draw_frame(path, subject, point_range, camera, source.name)
-            else:
-                draw_bev(path, subject, point_range, source.name)
+            with_image = frame.camera is not None and frame.camera.image is not None
+            picture = draw_frame if with_image else draw_bev
+            subject = Subject(frame, found, detector.classes)
+            picture(out / "pictures" / f"{frame.name}.png", subject, point_range, frame.name)
+        if frame.objects is not None:
+            truths.append(frame_labels(frame))
         total += len(found.boxes)
     if submit:
         write_submission(out / "submission.zip", out / "results")
-    return total
+    return total, truths
 
 
 def main(arguments: Sequence[str] | None) -> None:
@@ -257,7 +152,7 @@ def main(arguments: Sequence[str] | None) -> None:
             "/data/kitti --split test --checkpoint runs/hvnet/checkpoint.pt --out test",
         ],
     )
-    add_inputs(parser)
+    add_inputs(parser, SUFFIXES)
     add_checkpoint(parser)
     parser.add_argument(
         "--partial", action="store_true", help="with --split test: take the frames there are; no submission is written"
@@ -270,6 +165,7 @@ def main(arguments: Sequence[str] | None) -> None:
         metavar="N",
         help="draw the first N clouds, with boxes of score 0.5 or more (default: 20)",
     )
+    add_overlaps(parser)
     add_device(parser)
     options = parser.parse_args(arguments)
 
@@ -277,23 +173,30 @@ def main(arguments: Sequence[str] | None) -> None:
     if options.partial and options.split != "test":
         raise InputError("--partial: is for --split test")
     submit = options.split == "test" and not options.partial
-    sources = find_sources(options.inputs, options.split)
-    for folder in sorted({source.path / source.split_dir for source in sources if source.split_dir is not None}):
+    frames = find_frames(options.inputs, options.split)
+    roots = [part for part in frames.parts if isinstance(part, KittiFrames)]
+    for folder in sorted({part.root / part.split_dir for part in roots}):
         if not has_camera(folder):
             if submit:
                 raise InputError(f"{folder / 'calib'}: no such folder, and the KITTI server wants 2D boxes; add it")
             print(f"{folder}: has no calib, so no camera: every point counts, and there are no 2D boxes")
     if submit:
-        check_test_set([source.name for source in sources])
-        blind = sum(source.kitti_file("image_2", ".png") is None for source in sources)
+        check_test_set(frames.names)
+        blind = sum(
+            not (part.root / part.split_dir / "image_2" / f"{n}.png").is_file() for part in roots for n in part.names
+        )
         if blind:
             width, height = IMAGE_SIZE
             print(f"{blind} frames have no file in image_2; their 2D boxes are clipped to {width} x {height}")
     detector = load(options.checkpoint, options.device)
-    total = detect(detector, sources, options.out, options.pictures, submit)
-    if scores := score_results(sources, options.out / "results", detector.classes):
-        print(scores + "\n")
-    print(f"{total} boxes in {len(sources)} cloud{'s' * (len(sources) != 1)}")
+    rules = config_rules(detector.config, read_overlaps(options.overlap, detector.classes))
+    total, truths = detect(detector, frames, options.out, options.pictures, submit)
+    if len(truths) == len(frames):  # all are labelled
+        written = [read_labels(options.out / "results" / f"{name}.txt", scored=True) for name in frames.names]
+        print(format_table(evaluate(truths, written, classes=detector.classes, rules=rules)) + "\n")
+        if note := background_note((str(name) for truth in truths for name in truth.name), detector.classes):
+            print(textwrap.fill(note, 100))
+    print(f"{total} boxes in {len(frames)} cloud{'s' * (len(frames) != 1)}")
     print(f"results:    {options.out / 'results'}\nboxes:      {options.out / 'boxes.csv'}")
     if options.pictures > 0:
         print(f"pictures:   {options.out / 'pictures'}")

@@ -8,38 +8,25 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
-import torch
 from tqdm import tqdm
 
-from hvnet.cli import InputError, add_checkpoint, add_device, check_empty, make_parser, run_command
-from hvnet.detect import Source, add_inputs, camera_of, find_sources, read_source
-from hvnet.detector import Detector, load
-from hvnet.draw import FORMATS, Colour, Features, Subject, draw_bev, draw_features, draw_frame
+from hvnet.cli import add_checkpoint, add_device, add_inputs, make_parser, run_command
+from hvnet.data.clouds import SUFFIXES
+from hvnet.data.frame import Frame
+from hvnet.data.sources import find_frames
+from hvnet.evaluation.scoring import detect_frames
+from hvnet.exceptions import InputError
+from hvnet.folders import check_empty
+from hvnet.network.detector import Detector, load
+from hvnet.network.model import Detections
+from hvnet.pictures.clouds import FORMATS, Colour, Subject, draw_bev, draw_frame
+from hvnet.pictures.features import draw_features, features_of
 
 
-def features_of(detector: Detector, points: torch.Tensor, name: str) -> Features:
-    """The pseudo-images that a detector makes of points (N, 4), under the name of its model."""
-    config = detector.config.encoder
-    points = points.to(detector.device)
-    sample = torch.zeros(len(points), dtype=torch.int64, device=detector.device)
-    images = [image.to("cpu", torch.float32, copy=True) for image in detector.encode(points, sample, 1)]
-    length, width = config.voxel_size
-    cells = [(length * scale, width * scale) for scale in config.projection_scales]
-    return Features(name, images, cells, config.point_range[:2])
-
-
-def draw_source(source: Source, detector: Detector, path: Path, colour: Colour) -> torch.Tensor:
-    """Writes the figure of a cloud with its labels, if it has any, and detections; returns its points (N, 4)."""
-    cloud = read_source(source, detector.classes)
-    for note in cloud.notes:
-        tqdm.write(note)
-    subject = Subject(cloud.points, cloud.truth, *detector(cloud.points), detector.classes)
-    point_range, camera = detector.config.encoder.point_range, camera_of(source, cloud)
-    if camera is None:
-        draw_bev(path, subject, point_range, source.name, colour)
-    else:
-        draw_frame(path, subject, point_range, camera, source.name, colour)
-    return cloud.points
+def draw(frame: Frame, found: Detections, detector: Detector, path: Path, colour: Colour) -> None:
+    """Writes the figure of a frame with its labels, if it has any, and detections."""
+    picture = draw_bev if frame.camera is None else draw_frame
+    picture(path, Subject(frame, found, detector.classes), detector.config.encoder.point_range, frame.name, colour)
 
 
 def main(arguments: Sequence[str] | None) -> None:
@@ -56,7 +43,7 @@ def main(arguments: Sequence[str] | None) -> None:
             "cloud.bin --features --checkpoint with.pt --compare without.pt",
         ],
     )
-    add_inputs(parser)
+    add_inputs(parser, SUFFIXES)
     add_checkpoint(parser)
     parser.add_argument("--features", action="store_true", help="draw pseudo-images, too, as NAME-features")
     parser.add_argument(
@@ -71,7 +58,7 @@ def main(arguments: Sequence[str] | None) -> None:
     check_empty(options.out)
     if options.compare and not options.features:
         raise InputError("--compare: is for --features; give both")
-    sources = find_sources(options.inputs, options.split)
+    frames = find_frames(options.inputs, options.split)
     detector = load(options.checkpoint, options.device)
     models = [(detector, options.checkpoint.stem if options.checkpoint else "shipped weights")]
     if options.compare:
@@ -80,11 +67,12 @@ def main(arguments: Sequence[str] | None) -> None:
             models = [
                 (each, str(path)) for (each, _), path in zip(models, (options.checkpoint, options.compare), strict=True)
             ]
-    for source in tqdm(sources, desc="drawing", unit="cloud", dynamic_ncols=True):
-        points = draw_source(source, detector, options.out / f"{source.name}.{options.format}", options.colour)
+    bar = tqdm(range(len(frames)), desc="drawing", unit="cloud", dynamic_ncols=True)
+    for _, frame, found, _ in detect_frames(detector, frames, bar):
+        draw(frame, found, detector, options.out / f"{frame.name}.{options.format}", options.colour)
         if options.features:
-            found = [features_of(each, points, name) for each, name in models]
-            draw_features(options.out / f"{source.name}-features.{options.format}", found, source.name)
+            features = [features_of(each, frame.points, name) for each, name in models]
+            draw_features(options.out / f"{frame.name}-features.{options.format}", features, frame.name)
     print(f"figures: {options.out}")
 
 

@@ -1,107 +1,87 @@
-"""What a detector gets wrong in labelled KITTI frames: objects that it misses, and boxes where nothing is labelled."""
+"""A page of what a detector gets wrong in the validation split: `python -m hvnet.mistakes RUN`."""
 
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+import argparse
+import math
+from collections.abc import Sequence
+from pathlib import Path
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
-
-from hvnet.boxes import points_in_boxes
-from hvnet.data.kitti import Frame, project_boxes
-from hvnet.evaluate import CLASSES, MIN_OVERLAPS
-from hvnet.kernels.rotated import rotated_iou_bev
-from hvnet.matching import NEIGHBOURS
-from hvnet.model import Detections
-
-MISS, FALSE_POSITIVE = "miss", "false positive"
+from hvnet.cli import add_device, add_overlaps, make_parser, read_overlaps, run_command
+from hvnet.data.kitti import read_split_frames
+from hvnet.evaluation.rules import config_rules
+from hvnet.exceptions import InputError
+from hvnet.network.detector import load
+from hvnet.pictures.page import make_page
+from hvnet.training.folder import find_run
 
 
-class Mistake(NamedTuple):
-    """A labelled box that is not found, or a detection that is none."""
-
-    frame: str
-    kind: str  # MISS or FALSE_POSITIVE
-    name: str  # the class
-    box: Tensor  # (7,) float32, LiDAR axes
-    score: float  # of the detection; for a miss that of the detection of its class with the best overlap, 0 for none
-    distance: float  # of the box's centre from the LiDAR on the ground, in metres
-    points: int  # of the frame's cloud, inside the box
-    overlap: float  # best BEV IoU with a detection (for a miss) or a label (for a false positive) of the class
+def _share(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"{text} is no score: want a number from 0 to 1")
+    return value
 
 
-def find_mistakes(frame: Frame, detections: Detections, classes: Sequence[str], min_score: float) -> list[Mistake]:
-    """The mistakes of a frame's detections (M boxes, labels that index `classes`): misses first, class by class.
-
-    Only the classes that KITTI scores have mistakes.
-
-    A labelled box of one of the classes is missed if no detection of its class with score >= min_score reaches KITTI's
-    BEV IoU of the class (0.7 for Car, 0.5 else). A miss with an overlap above it was found, with a lower score.
-
-    A detection with score >= min_score is a false positive if it reaches that IoU with no label of its class, unless
-    KITTI does not score it: where a Van lies under a Car or a Person_sitting under a Pedestrian, where more than half
-    of its 2D box is in a DontCare region, or where none of it is in the image.
-    """
-    bbox, visible = project_boxes(detections.boxes.double().numpy(), frame.calib, frame.image_size)
-    regions = frame.labels.bbox[frame.labels.name == "DontCare"]
-    unscored = torch.from_numpy(~visible | (_largest_share(bbox, regions) > 0.5))
-    found: dict[str, list[Mistake]] = {MISS: [], FALSE_POSITIVE: []}
-
-    def note(kind: str, name: str, boxes: Tensor, scores: Tensor, overlaps: Tensor) -> None:
-        points = points_in_boxes(frame.points, boxes).sum(dim=0)
-        distances = torch.linalg.vector_norm(boxes[:, :2], dim=1)
-        rows = zip(boxes, *(column.tolist() for column in (scores, distances, points, overlaps)), strict=True)
-        found[kind] += [Mistake(frame.id, kind, name, *row) for row in rows]
-
-    for label, name in enumerate(classes):
-        if name not in CLASSES:  # there is no overlap that it would have to reach
-            continue
-        enough = MIN_OVERLAPS["strict"][name]["bev"]
-        own = detections.labels == label
-        boxes, scores, left_out = detections.boxes[own], detections.scores[own], unscored[own]
-        counts = scores >= min_score
-        truth = _boxes_of(frame, name)
-        iou = rotated_iou_bev(truth, boxes)  # (T, M_own)
-
-        missed = _largest(iou[:, counts], dim=1)[0] < enough
-        overlaps, best = _largest(iou, dim=1)
-        score_of_best = torch.where(overlaps > 0, scores[best] if len(scores) else 0.0, 0.0)
-        note(MISS, name, truth[missed], score_of_best[missed], overlaps[missed])
-
-        overlaps, _ = _largest(iou, dim=0)
-        if name in NEIGHBOURS:
-            near, _ = _largest(rotated_iou_bev(_boxes_of(frame, NEIGHBOURS[name]), boxes), dim=0)
-            left_out = left_out | (near >= enough)
-        wrong = counts & (overlaps < enough) & ~left_out
-        note(FALSE_POSITIVE, name, boxes[wrong], scores[wrong], overlaps[wrong])
-    return found[MISS] + found[FALSE_POSITIVE]
+def _positive(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text} is no count: want 1 or more")
+    return int(text)
 
 
-def worst(mistakes: Iterable[Mistake], count: int) -> tuple[list[Mistake], list[Mistake]]:
-    """The first `count` misses, those with the most points in the box first, and false positives, best score first."""
-    both = list(mistakes)
-    misses = sorted((each for each in both if each.kind == MISS), key=lambda each: -each.points)
-    false_positives = sorted((each for each in both if each.kind == FALSE_POSITIVE), key=lambda each: -each.score)
-    return misses[:count], false_positives[:count]
+def main(arguments: Sequence[str] | None) -> None:
+    """The command."""
+    parser = make_parser(
+        "mistakes",
+        "Writes a page (HTML, all pictures inside) of a run: its evaluation in the validation split, its curves, and "
+        "the worst misses and false positives, from above and, with a camera, in the image.",
+        [
+            "runs/demo",
+            "runs/compact --data /data/kitti --count 50 --min-score 0.3",
+            "model.pt --data /data/kitti --out model.html",
+        ],
+    )
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run of hvnet.train, or a checkpoint")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="a KITTI root (default: the one that the run names)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="(default: mistakes.html in the folder of the run, or here)",
+    )
+    parser.add_argument("--count", type=_positive, default=20, metavar="N", help="of each kind (default: 20)")
+    parser.add_argument(
+        "--min-score", type=_share, default=0.5, metavar="X", help="detections below do not count (default: 0.5)"
+    )
+    add_overlaps(parser)
+    add_device(parser)
+    options = parser.parse_args(arguments)
+
+    run = find_run(options.run)
+    root = options.data or run.root
+    if root is None:
+        raise InputError(f"{options.run}: does not name the data that it was trained on; give a KITTI root with --data")
+    out = options.out or (options.run if options.run.is_dir() else Path()) / "mistakes.html"
+    if out.is_dir():
+        raise InputError(f"{out}: is a folder; --out names the page, such as {out / 'mistakes.html'}")
+    if not out.parent.is_dir() and (out.parent.exists() or not out.parent.parent.is_dir()):
+        raise InputError(f"{out.parent}: no folder; --out names the page, such as mistakes.html")
+    detector = load(run.checkpoint, options.device)
+    page = make_page(
+        run.checkpoint,
+        run.metrics,
+        detector,
+        read_split_frames(root, "val"),
+        of=str(root),
+        count=options.count,
+        min_score=options.min_score,
+        rules=config_rules(detector.config, read_overlaps(options.overlap, detector.classes)),
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(page, encoding="utf-8")
+    print(f"page: {out}")
 
 
-def _boxes_of(frame: Frame, name: str) -> Tensor:
-    """The labelled boxes (T, 7) of a class."""
-    return frame.boxes[[each == name for each in frame.names]]
-
-
-def _largest(iou: Tensor, dim: int) -> tuple[Tensor, Tensor]:
-    """The largest value along a dimension and its index, both 0 where that dimension is empty."""
-    if iou.shape[dim]:
-        values, at = iou.max(dim=dim)
-        return values, at
-    none = iou.sum(dim=dim)
-    return none, none.long()
-
-
-def _largest_share(bbox: NDArray[np.float64], regions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The largest share of each 2D box (M, 4) that lies in one of the regions (R, 4): (M,)."""
-    size = np.minimum(bbox[:, None, 2:], regions[:, 2:]) - np.maximum(bbox[:, None, :2], regions[:, :2])  # (M, R, 2)
-    area = (bbox[:, 2:] - bbox[:, :2]).prod(axis=1)
-    return size.clip(min=0).prod(axis=2).max(axis=1, initial=0) / np.where(area > 0, area, 1)
+if __name__ == "__main__":
+    run_command(main)

@@ -39,7 +39,7 @@ def rank() -> int:
     return dist.get_rank() if dist.is_initialized() else 0
 
 
-def of_first(value: Any) -> Any:
+def broadcast(value: Any) -> Any:
     """The value that rank 0 gives; the others wait for it."""
     if size() == 1:
         return value
@@ -48,7 +48,7 @@ def of_first(value: Any) -> Any:
     return values[0]
 
 
-def gathered(value: Any) -> list[Any]:
+def all_gather(value: Any) -> list[Any]:
     """The values of all ranks, on every rank."""
     if size() == 1:
         return [value]
@@ -57,7 +57,7 @@ def gathered(value: Any) -> list[Any]:
     return values
 
 
-class _Joined(torch.autograd.Function):
+class _AllReduce(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, value: Tensor) -> Tensor:
         total = value.clone()
@@ -71,9 +71,9 @@ class _Joined(torch.autograd.Function):
         return total
 
 
-def joined(value: Tensor) -> Tensor:
+def all_reduce(value: Tensor) -> Tensor:
     """The sum of a tensor over all ranks; the gradient is that of the sum of what all ranks make of it."""
-    return _Joined.apply(value) if size() > 1 else value
+    return _AllReduce.apply(value) if size() > 1 else value
 
 
 class BatchNorm2d(nn.BatchNorm2d):
@@ -86,9 +86,9 @@ class BatchNorm2d(nn.BatchNorm2d):
         wide = features.float()
         variance, mean = torch.var_mean(wide, dim=(0, 2, 3), correction=0)
         count = torch.full_like(mean[:1], wide[:, 0].numel())
-        total = joined(torch.cat((count, count * mean)))
+        total = all_reduce(torch.cat((count, count * mean)))
         joint = total[1:] / total[0]
-        squares = joined(count * (variance + (mean - joint).square()))
+        squares = all_reduce(count * (variance + (mean - joint).square()))
         with torch.no_grad():
             momentum = self.momentum or 0.1
             self.get_buffer("running_mean").lerp_(joint, momentum)
@@ -99,7 +99,7 @@ class BatchNorm2d(nn.BatchNorm2d):
         return (wide * scale[:, None, None] + shift[:, None, None]).to(features.dtype)
 
 
-def parallel(model: nn.Module) -> nn.Module:
+def wrap_ddp(model: nn.Module) -> nn.Module:
     """The model with gradients that are averaged over the ranks; alone, the model itself."""
     if size() == 1:
         return model

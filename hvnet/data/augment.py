@@ -14,7 +14,7 @@ from torch import Generator, Tensor
 
 from hvnet.boxes import boxes_collide, limit_angle, points_in_boxes
 from hvnet.config import AugmentConfig
-from hvnet.data.database import Database, object_points
+from hvnet.data.gt_database import Database, object_points
 
 MIN_POINTS = 5
 """Objects of fewer points are not inserted, as in SECOND."""

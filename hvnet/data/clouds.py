@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyParseError
 from pypcd4 import PointCloud
 
-from hvnet.cli import InputError
 from hvnet.data.kitti import drop_non_finite, read_points
+from hvnet.exceptions import InputError
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
 REFLECTANCE = ("reflectance", "intensity", "reflectivity", "i", "scalar_intensity")

@@ -9,10 +9,16 @@ from pathlib import Path
 
 import torch
 
-from hvnet import train
-from hvnet.cli import InputError, add_device, make_parser, run_command
-from hvnet.data.database import FILE_NAME
-from hvnet.model import load_checkpoint, save_checkpoint
+from hvnet.cli import add_device, make_parser, run_command
+from hvnet.config import load_config
+from hvnet.data.gt_database import FILE_NAME
+from hvnet.devices import select_device
+from hvnet.exceptions import InputError
+from hvnet.network.checkpoint import load_checkpoint, save_checkpoint
+from hvnet.network.model import HVNet
+from hvnet.training.batches import kitti_data
+from hvnet.training.folder import check_folder, check_room
+from hvnet.training.run import Run
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "compact.yaml"
 RECIPE = (
@@ -61,9 +67,11 @@ def main(arguments: Sequence[str] | None) -> None:
     if not (options.data / FILE_NAME).is_file():
         raise InputError(f"{options.data / FILE_NAME}: no such file; other objects would make other weights")
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    command = ["--config", str(CONFIG), "--data", str(options.data), "--out", str(options.run)]
-    command += ["--device", options.device, *(["--resume"] if options.resume else [])]
-    train.main(command + [part for change in RECIPE for part in ("--set", change)])
+    config = load_config(CONFIG, RECIPE)
+    check_folder(options.run, options.resume)
+    check_room(options.run, HVNet(config))
+    data = kitti_data(options.data, config)
+    Run(config, data, options.run, select_device(options.device), resume=options.resume).train()
     halve(options.run / "checkpoint.pt", options.out)
     print(f"weights:    {options.out} ({options.out.stat().st_size / 1e6:.2f} MB)")
 

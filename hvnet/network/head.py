@@ -6,8 +6,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from hvnet.anchors import anchors_per_cell
 from hvnet.config import ClassConfig, HeadConfig
+from hvnet.network.anchors import anchors_per_cell
 
 PRIOR = 0.01  # probability of an object that an untrained head gives (RetinaNet)
 

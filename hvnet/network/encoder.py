@@ -6,46 +6,14 @@ import torch
 from torch import Tensor, nn
 
 from hvnet.config import EncoderConfig
-from hvnet.kernels.encode import (
-    Scale,
-    add_of_voxels,
-    attend,
-    clear_voxels,
-    column_sums,
-    encode_voxels,
-    knowledge,
-    project_voxels,
-    scales_of,
-    voxel_means,
-    write_image,
-)
+from hvnet.kernels.encode import attend, column_sums, knowledge, write_image
 from hvnet.kernels.scatter import Segments, segment_add, segment_max, segment_mean
-from hvnet.kernels.voxel import Grid, Voxels, is_nested, make_grid, nested_index, voxel_index
-from hvnet.pillars import PillarEncoder, hard_voxels
-from hvnet.ranks import joined, size
+from hvnet.kernels.voxel import Grid, Voxels, make_grid, voxel_index
+from hvnet.network.grids import projection_grids
+from hvnet.network.pillars import hard_voxels
+from hvnet.ranks import all_reduce, size
 
 POINT_CHANNELS = 4  # d: x, y, z, reflectance
-
-
-def pyramid_depth(config: EncoderConfig) -> int:
-    """Blocks of the main stream: three, or one a projection scale; each but the first halves the map."""
-    return max(3, len(config.projection_scales))
-
-
-def projection_grids(config: EncoderConfig) -> list[Grid]:
-    """The grids of S_R, finest first; the finest is padded so that every block of the backbone may halve it evenly."""
-    finest = make_grid(config.point_range, config.voxel_size, config.projection_scales[0], 2 ** pyramid_depth(config))
-    grids = [finest]
-    for _ in config.projection_scales[1:]:
-        last = grids[-1]
-        grids.append(
-            last._replace(
-                cell=(2 * last.cell[0], 2 * last.cell[1]),
-                cells=(-(-last.cells[0] // 2), -(-last.cells[1] // 2)),
-                shape=(last.shape[0] // 2, last.shape[1] // 2),
-            )
-        )
-    return grids
 
 
 def moments(rows: Tensor) -> Tensor:
@@ -58,10 +26,10 @@ def has_variance(training: bool, rows: Tensor) -> bool:
     """Whether the rows (N, C) of all ranks give the statistics of a batch norm: one or none has no variance."""
     if not training or size() == 1:
         return training and rows.shape[0] > 1
-    return joined(torch.full((), rows.shape[0], device=rows.device)).item() > 1
+    return all_reduce(torch.full((), rows.shape[0], device=rows.device)).item() > 1
 
 
-def folded(linear: nn.Linear, norm: nn.BatchNorm1d, of_rows: Tensor | None) -> Tensor:
+def folded(linear: nn.Linear, norm: nn.BatchNorm1d, row_moments: Tensor | None) -> Tensor:
     """Linear and batch norm as one affine map (in + 1, out), the bias last.
 
     In training the statistics of Linear(rows) follow from the moments (in + 1, in + 1) of the rows, as W mean and
@@ -69,12 +37,12 @@ def folded(linear: nn.Linear, norm: nn.BatchNorm1d, of_rows: Tensor | None) -> T
     variance) the running statistics serve.
     """
     weight = linear.weight
-    if of_rows is None:
+    if row_moments is None:
         mean, variance = norm.get_buffer("running_mean"), norm.get_buffer("running_var")
     else:
-        count = of_rows[-1, -1]
-        centre = of_rows[-1, :-1] / count
-        covariance = (of_rows[:-1, :-1] / count - torch.outer(centre, centre)).to(weight.dtype)
+        count = row_moments[-1, -1]
+        centre = row_moments[-1, :-1] / count
+        covariance = (row_moments[:-1, :-1] / count - torch.outer(centre, centre)).to(weight.dtype)
         mean = weight @ centre.to(weight.dtype)
         variance = ((weight @ covariance) * weight).sum(dim=1).clamp(min=0)
         update_statistics(norm, mean.detach(), variance.detach() * (count / (count - 1)).to(weight.dtype))
@@ -121,10 +89,10 @@ class AttentiveVFE(nn.Module):
 
         M is (N, q), or (0, q) unless it is to be kept, G' (V, q).
         """
-        of_rows = None
+        row_moments = None
         if has_variance(self.training, points):
-            of_rows = joined(torch.stack([scale.moments for scale in voxels]).sum(dim=0))
-        layer = torch.vstack((folded(self.knowledge, self.knowledge_norm, of_rows), norm))
+            row_moments = all_reduce(torch.stack([scale.moments for scale in voxels]).sum(dim=0))
+        layer = torch.vstack((folded(self.knowledge, self.knowledge_norm, row_moments), norm))
         return [attend(features, points, scale.mean, layer, scale.segments, self.relu, keep) for scale in voxels]
 
 
@@ -195,8 +163,8 @@ class HybridVoxelEncoder(nn.Module):
             return self.avfe(self.avfe.features(points), points, at)
         ones = torch.ones_like(points[:, :1])
         training = has_variance(self.training, points)
-        of_rows = joined(moments(torch.cat((points, ones), dim=1))) if training else None
-        weight = folded(self.avfe.features, self.avfe.features_norm, of_rows)
+        row_moments = all_reduce(moments(torch.cat((points, ones), dim=1))) if training else None
+        weight = folded(self.avfe.features, self.avfe.features_norm, row_moments)
         features = torch.addmm(weight[-1], points, weight[:-1])
         as_it_is = torch.vstack((torch.ones_like(weight[-1]), torch.zeros_like(weight[-1])))
         return self.avfe(features, as_it_is, points, at, keep=True)
@@ -238,7 +206,7 @@ def batch_norm(norm: nn.BatchNorm1d, rows: Tensor) -> Tensor:
         mean, variance = norm.get_buffer("running_mean"), norm.get_buffer("running_var")
     else:
         total, squares = column_sums(rows)
-        sums = joined(torch.cat((total, squares, torch.full_like(total[:1], rows.shape[0]))))
+        sums = all_reduce(torch.cat((total, squares, torch.full_like(total[:1], rows.shape[0]))))
         (total, squares), count = sums[:-1].chunk(2), sums[-1].detach()
         mean = total / count
         variance = (squares / count - mean.square()).clamp(min=0).to(rows.dtype)
@@ -246,86 +214,3 @@ def batch_norm(norm: nn.BatchNorm1d, rows: Tensor) -> Tensor:
         update_statistics(norm, mean.detach(), variance.detach() * (count / (count - 1)).to(rows.dtype))
     scale = norm.weight * torch.rsqrt(variance + norm.eps)
     return torch.vstack((scale, norm.bias - mean * scale))
-
-
-class FusedEncoder:
-    """Inference with the weights of an encoder: the same images, with batch norms folded and nothing kept for training.
-
-    Where the scales nest, nothing is read back from a GPU: arrays have the size of the points and counts stay on the
-    device. The images are reused: they hold until the next call, which clears them. An encoder whose scales do not
-    nest, that has no attention or drops points, runs as it is.
-    """
-
-    def __init__(self, encoder: HybridVoxelEncoder | PillarEncoder) -> None:
-        self.encoder = encoder
-        self.written: dict[tuple, tuple[Tensor, Scale]] = {}  # every image, and the voxels that were written last
-
-    @torch.no_grad()
-    def __call__(
-        self, points: Tensor, sample: Tensor, batch_size: int, dtype: torch.dtype = torch.float32
-    ) -> list[Tensor]:
-        """As HybridVoxelEncoder in evaluation mode; the images are of the dtype, float32, float16 or bfloat16."""
-        encoder = self.encoder
-        if not self.is_fused(batch_size):
-            training = encoder.training
-            images = encoder.eval()(points, sample, batch_size)
-            encoder.train(training)
-            return [image.to(dtype) for image in images]
-        assert isinstance(encoder, HybridVoxelEncoder)
-        avfe, avfeo = encoder.avfe, encoder.avfeo
-        assert isinstance(avfe, AttentiveVFE)
-        assert isinstance(avfeo, AttentiveVFE)
-        grids = list(dict.fromkeys(encoder.feature_grids + encoder.projection_grids))
-        index = nested_index(points, sample, grids)
-        parts, kept, rows = scales_of(index)
-        points = points[index.order[:rows]]
-        scales = dict(zip(grids, parts, strict=True))
-        means = {grid: voxel_means(points, scale) for grid, scale in scales.items()}
-
-        weight = folded(avfe.features, avfe.features_norm, None)
-        features = torch.addmm(weight[-1], points, weight[:-1])
-        weight = folded(avfe.knowledge, avfe.knowledge_norm, None)
-        count = features.shape[1]
-        at = [scales[grid] for grid in encoder.feature_grids]
-        product = features.new_empty(points.shape[0], len(at) * count)  # M of every feature scale
-        maxima = [
-            encode_voxels(features, points, means[grid], weight, scales[grid], avfe.relu, product, t)
-            for t, grid in enumerate(encoder.feature_grids)
-        ]
-        weight = folded(avfeo.features, avfeo.features_norm, None)
-        halves = weight[:-1].chunk(2 * len(at))
-        context = torch.addmm(weight[-1], product, torch.cat(halves[0::2]))
-        of_voxels = context.new_empty(len(at), max(scale.rows for scale in at), context.shape[1])
-        for t, (values, half) in enumerate(zip(maxima, halves[1::2], strict=True)):
-            torch.mm(values, half, out=of_voxels[t, : len(values)])
-        add_of_voxels(context, of_voxels, index.voxel[: len(at)], kept)
-        weight = folded(avfeo.knowledge, avfeo.knowledge_norm, None)
-        images = []
-        for grid in encoder.projection_grids:
-            image = self.image(grid, scales[grid], batch_size, context.shape[1], dtype, points.device)
-            project_voxels(context, points, means[grid], weight, scales[grid], avfeo.relu, image)
-            images.append(image.view(batch_size, *grid.shape, -1).permute(0, 3, 1, 2))
-        return images
-
-    def is_fused(self, batch_size: int) -> bool:
-        """Whether one sort serves all scales of an attentive encoder, so that nothing is read from the device."""
-        encoder = self.encoder
-        if isinstance(encoder, PillarEncoder) or isinstance(encoder.avfe, VFE) or encoder.limits[0]:
-            return False
-        return is_nested(encoder.feature_grids + encoder.projection_grids, batch_size)
-
-    def image(
-        self, grid: Grid, scale: Scale, batch_size: int, channels: int, dtype: torch.dtype, device: torch.device
-    ) -> Tensor:
-        """The image (B N_L N_W, C) of a grid, all zero, to be written at the voxels of the scale."""
-        key = (grid, batch_size, dtype, device)
-        if key in self.written:
-            image, last = self.written[key]
-            if device.type == "cuda":
-                image.zero_()  # a graph replays what was captured: it would not know the cells written last
-            else:
-                clear_voxels(image, last)
-        else:
-            image = torch.zeros(batch_size * grid.shape[0] * grid.shape[1], channels, dtype=dtype, device=device)
-        self.written[key] = image, scale
-        return image

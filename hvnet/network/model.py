@@ -1,22 +1,20 @@
 """HVNet: encoder, backbone and one head a class; `forward` returns maps, `detect` returns boxes."""
 
-import os
-import platform
-from pathlib import Path
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from hvnet.anchors import assign_targets, decode, make_anchors
-from hvnet.backbone import Backbone
-from hvnet.cli import InputError
-from hvnet.config import Config, EncoderConfig, config_from_dict
-from hvnet.encoder import HybridVoxelEncoder, projection_grids
-from hvnet.head import Head, HeadMaps, scores_of
+from hvnet.config import Config, EncoderConfig
 from hvnet.kernels.rotated import rotated_nms
-from hvnet.loss import class_loss
-from hvnet.pillars import PillarEncoder
+from hvnet.network.anchors import assign_targets, decode, make_anchors
+from hvnet.network.backbone import Backbone
+from hvnet.network.encoder import HybridVoxelEncoder
+from hvnet.network.grids import projection_grids
+from hvnet.network.head import Head, HeadMaps, scores_of
+from hvnet.network.loss import class_loss
+from hvnet.network.pillars import PillarEncoder
 
 
 class Detections(NamedTuple):
@@ -25,6 +23,14 @@ class Detections(NamedTuple):
     boxes: Tensor  # (M, 7)
     scores: Tensor  # (M,)
     labels: Tensor  # (M,) int64, index into config.head.classes
+
+    def select(self, rows: Tensor) -> "Detections":
+        """The detections that a mask or an index tensor picks."""
+        return Detections(self.boxes[rows], self.scores[rows], self.labels[rows])
+
+    def names(self, classes: Sequence[str]) -> list[str]:
+        """The classes (M,) by name."""
+        return [classes[label] for label in self.labels.tolist()]
 
 
 LOSS_TERMS = ("classification", "localization", "vertical", "direction", "iou")
@@ -91,7 +97,7 @@ class HVNet(nn.Module):
     def detect(self, points: Tensor, sample: Tensor, batch_size: int) -> list[Detections]:
         """Boxes of every sample, in evaluation mode: scores above the threshold, then rotated NMS class by class.
 
-        This is the plain way, in float32; `hvnet.detector` has the fast one.
+        This is the plain way, in float32; `hvnet.network.detector` has the fast one.
         """
         if self.training:
             raise RuntimeError("detect: the model is in training mode; call eval() first")
@@ -112,69 +118,3 @@ class HVNet(nn.Module):
         boxes = decode(maps.location[at], maps.vertical[at], direction, self.anchors(label)[at])
         kept = rotated_nms(boxes, scores[at], head.classes[label].nms_iou)[: head.detections]
         return Detections(boxes[kept], scores[at][kept], torch.full_like(kept, label))
-
-
-def save_checkpoint(path: Path, content: dict) -> None:
-    """Writes a checkpoint atomically: whatever happens, there is the old file or the new one, never half of one.
-
-    Raises InputError naming the file if it cannot be written.
-    """
-    partial = path.with_suffix(".partial")
-    try:
-        with partial.open("wb") as file:
-            torch.save(content, file)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except (OSError, RuntimeError) as error:  # torch's writer turns some errors of the system into RuntimeError
-        partial.unlink(missing_ok=True)
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        kept = "; what it held before is whole: make room and --resume" if path.is_file() else ""
-        raise InputError(f"{path}: cannot be written ({reason}){kept}") from error
-
-
-def load_checkpoint(path: str | Path) -> dict:
-    """Reads a checkpoint to the CPU (weights_only, so that it can run no code). Raises InputError naming the file."""
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such checkpoint; train one with python -m hvnet.train") from error
-    except Exception as error:  # the unpickler raises anything at all on a file that is damaged
-        raise InputError(f"{path}: truncated, or no checkpoint of hvnet.train; train again or copy it again") from error
-    if not isinstance(content, dict) or not {"config", "model"} <= content.keys():
-        raise InputError(f"{path}: no checkpoint of hvnet.train (it holds no config and model)")
-    return content
-
-
-def model_from_checkpoint(content: dict, source: str) -> HVNet:
-    """The model of what `load_checkpoint` read from source, in evaluation mode. Raises InputError naming source."""
-    model = HVNet(config_from_dict(content["config"], source))
-    try:
-        model.load_state_dict(content["model"])
-    except (RuntimeError, AttributeError, TypeError) as error:
-        raise InputError(f"{source}: its weights do not fit its config; train again with this version") from error
-    return model.eval()
-
-
-def select_device(name: str) -> torch.device:
-    """The device named auto, cpu or cuda (or cuda:1, ...); auto is CUDA where there is a GPU."""
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    if name.startswith("cuda") and not torch.cuda.is_available():
-        raise InputError(f"--device {name}: torch sees no CUDA device; use --device cpu")
-    if name.partition(":")[0] not in ("cpu", "cuda"):
-        raise InputError(f"--device {name}: want auto, cpu or cuda")
-    try:
-        return torch.device(name)
-    except RuntimeError as error:
-        raise InputError(f"--device {name}: want auto, cpu, cuda or cuda:N") from error
-
-
-def device_name(device: torch.device) -> str:
-    """What a device is called: the GPU's or the processor's name."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()

@@ -1,4 +1,4 @@
-"""Matching of detections with ground truths by the rules of KITTI's devkit, for `hvnet.evaluate`.
+"""Matching of detections with ground truths by the rules of KITTI's devkit, for `precision`.
 
 The devkit (evaluate_object_3d_offline; Geiger et al., CVPR 2012) matches every frame once per score threshold. Here a
 frame is matched once for every score that one of its overlapping detections has, since nothing else can change its
@@ -8,23 +8,19 @@ counts; the running sum over all frames then holds the devkit's counts at every 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numba import njit
 from numpy.typing import NDArray
 
-from hvnet.data.kitti import Labels
+from hvnet.data.labels import DONTCARE, Labels, concatenate
 from hvnet.kernels.rotated import rotated_overlap_pairs
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
-METRICS = ("2d", "bev", "3d")
-NEIGHBOURS = {"Car": "Van", "Pedestrian": "Person_sitting"}
-"""So like a class that to find one is neither right nor wrong."""
 
 
 class Level(NamedTuple):
@@ -124,30 +120,25 @@ def find_candidates(labels: Sequence[Labels], predictions: Sequence[Labels]) -> 
     pairs = {"2d": Pairs(frame, truth, detection, shared / (area_a + area_b - shared))}
 
     dontcare = np.zeros(len(detections))
-    regions = truths.name[truth] == "DontCare"
+    regions = truths.name[truth] == DONTCARE
     np.maximum.at(dontcare, detection[regions], (shared / area_b)[regions])
 
-    bev_truths, bev_detections = _bev_boxes(truths), _bev_boxes(detections)
+    bev_truths, bev_detections = truths.bev_boxes(), detections.bev_boxes()
     bounds = _bev_bounds(bev_truths), _bev_bounds(bev_detections)
     frame, truth, detection = _meeting(bounds[0], truth_starts, bounds[1], detection_starts).T
     a, b = bev_truths[truth], bev_detections[detection]
     shared = rotated_overlap_pairs(torch.from_numpy(a), torch.from_numpy(b)).numpy()
     area_a, area_b = a[:, 3] * a[:, 4], b[:, 3] * b[:, 4]
     pairs["bev"] = Pairs(frame, truth, detection, shared / (area_a + area_b - shared))
-    (top_a, bottom_a), (top_b, bottom_b) = _vertical(truths, truth), _vertical(detections, detection)
+    (top_a, bottom_a), (top_b, bottom_b) = truths.select(truth).vertical(), detections.select(detection).vertical()
     shared = shared * np.maximum(np.minimum(bottom_a, bottom_b) - np.maximum(top_a, top_b), 0)
     volume = area_a * a[:, 5] + area_b * b[:, 5] - shared
     pairs["3d"] = Pairs(frame, truth, detection, shared / np.where(volume > 0, volume, 1))
     return Candidates(truths, detections, detections.score, pairs, dontcare)
 
 
-def ground_distance(labels: Labels) -> Floats:
-    """Distance (K,) from the camera on the ground, in metres."""
-    return np.hypot(labels.location[:, 0], labels.location[:, 2])
-
-
 def _outside(labels: Labels, level: Level) -> Mask:
-    distance = ground_distance(labels)
+    distance = labels.ground_distance()
     return (distance < level.distance[0]) | (distance >= level.distance[1])
 
 
@@ -158,10 +149,15 @@ def select_truths(labels: Labels, name: str, level: Level) -> Mask:
     return (labels.name == name) & ~(hard | (height <= level.min_height) | _outside(labels, level))
 
 
-def clean_data(candidates: Candidates, name: str, metric: str, min_overlap: float, level: Level) -> Matching:
-    """The devkit's cleaning of the data for one class, metric, overlap and level."""
+def clean_data(
+    candidates: Candidates, name: str, metric: str, min_overlap: float, level: Level, neighbour: str | None = None
+) -> Matching:
+    """The devkit's cleaning of the data for one class, metric, overlap and level.
+
+    To find an object of the neighbouring class is neither right nor wrong.
+    """
     labels, detections = candidates.truths, candidates.detections
-    matchable = (labels.name == name) | (labels.name == NEIGHBOURS.get(name, name))
+    matchable = (labels.name == name) | (labels.name == (neighbour or name))
     own = detections.name == name
     # the devkit counts whole pixels here, and ignores a low detection of any class: it may hide a ground truth
     height = np.trunc(np.abs(detections.bbox[:, 3] - detections.bbox[:, 1]))
@@ -218,19 +214,7 @@ def match_at(matching: Matching, candidates: Candidates, threshold: float) -> tu
 
 def _concatenate(frames: Sequence[Labels]) -> tuple[Labels, Integers]:
     """The rows of all frames, and where each frame's begin (F + 1,)."""
-    starts = np.cumsum([0, *(len(frame) for frame in frames)])
-    columns: dict[str, Any] = {}
-    for field in fields(Labels):
-        parts = [getattr(frame, field.name) for frame in frames]
-        columns[field.name] = None if any(part is None for part in parts) else np.concatenate(parts)
-    return Labels(**columns), starts
-
-
-def _bev_boxes(labels: Labels) -> Floats:
-    """Boxes (K, 7) whose first two coordinates are the camera's x and z: its y points down, hence the minus."""
-    height, width, length = labels.dimensions.T
-    x, y, z = labels.location.T
-    return np.column_stack((x, z, y - height / 2, length, width, height, -labels.rotation_y))
+    return concatenate(frames), np.cumsum([0, *(len(frame) for frame in frames)])
 
 
 def _bev_bounds(boxes: Floats) -> Floats:
@@ -239,12 +223,6 @@ def _bev_bounds(boxes: Floats) -> Floats:
     half = np.column_stack((boxes[:, 3] * cos + boxes[:, 4] * sin, boxes[:, 3] * sin + boxes[:, 4] * cos)) / 2
     half[(boxes[:, 3:5] <= 0).any(axis=1)] = -np.inf
     return np.column_stack((boxes[:, :2] - half, boxes[:, :2] + half))
-
-
-def _vertical(labels: Labels, rows: Integers) -> tuple[Floats, Floats]:
-    """Top and bottom on the camera's y, which points down."""
-    bottom = labels.location[rows, 1]
-    return bottom - labels.dimensions[rows, 0], bottom
 
 
 @njit(cache=True, nogil=True)

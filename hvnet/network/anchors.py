@@ -8,8 +8,8 @@ from torch import Tensor
 
 from hvnet.boxes import bev_corners, limit_angle
 from hvnet.config import ClassConfig, Config
-from hvnet.encoder import projection_grids, pyramid_depth
 from hvnet.kernels.rotated import rotated_match
+from hvnet.network.grids import projection_grids, pyramid_depth
 
 ORIENTATIONS = (0.0, math.pi / 4, math.pi / 2, 3 * math.pi / 4)
 

@@ -15,16 +15,19 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from hvnet.anchors import anchors_per_cell, decode
-from hvnet.encoder import FusedEncoder
-from hvnet.head import LOCATION_VALUES, Head, scores_of
+from hvnet.devices import select_device
 from hvnet.kernels.rotated import nms_order
-from hvnet.model import Detections, HVNet, load_checkpoint, model_from_checkpoint, select_device
+from hvnet.network.anchors import anchors_per_cell, decode
+from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint
+from hvnet.network.encoder import HybridVoxelEncoder
+from hvnet.network.fused import FusedEncoder, is_fused
+from hvnet.network.head import LOCATION_VALUES, Head, scores_of
+from hvnet.network.model import Detections, HVNet
 
-SHIPPED = Path(__file__).resolve().parent / "weights" / "compact.pt"
+SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "compact.pt"
 """The weights that come with the package: see docs/model_card.md."""
 
-MOST_GRAPHS = 4
+MAX_GRAPHS = 4
 """CUDA graphs that a detector keeps: each holds the memory of all that it calculates."""
 
 
@@ -49,7 +52,10 @@ class Detector:
         self.entries = model.config.head.classes
         self.classes = tuple(entry.name for entry in model.config.head.classes)
         model = copy.deepcopy(model).to(device).eval()
-        self.encoder = FusedEncoder(model.encoder)
+        self.encoder = model.encoder
+        self.fused: FusedEncoder | None = None
+        if isinstance(model.encoder, HybridVoxelEncoder) and is_fused(model.encoder, 1):
+            self.fused = FusedEncoder(model.encoder)
         self.backbone = fold_batch_norms(model.backbone).to(dtype=self.dtype)
         heads = [cast(Head, head) for head in model.heads]
         # the score's branch of every class, and that of the IoU if there is one
@@ -64,7 +70,7 @@ class Detector:
     def __call__(self, points: Tensor | NDArray) -> Detections:
         """Points (N, 4), x, y, z in metres and reflectance in [0, 1], to boxes (M, 7), scores (M,), labels (M,).
 
-        Points outside the range and points that are not finite take no part. The results lie on the host.
+        Points outside the range and points that are not finite are ignored. The results lie on the host.
         """
         return self.batch([points])[0]
 
@@ -88,21 +94,28 @@ class Detector:
 
         They hold until the next call.
         """
-        if self.device.type != "cuda" or not self.encoder.is_fused(batch_size):
+        if self.device.type != "cuda" or not self.is_fused(batch_size):
             return self.score(self.backbone(self.encode(points, sample, batch_size)))
         # the graph is for a number of points: the next power of two, filled up with points that are outside
         capacity = 1 << max(len(points) - 1, 1023).bit_length()
         key = (batch_size, capacity)
         with torch.cuda.device(self.device):
             if key not in self.graphs:
-                while len(self.graphs) >= MOST_GRAPHS:
+                while len(self.graphs) >= MAX_GRAPHS:
                     del self.graphs[next(iter(self.graphs))]
                 self.graphs[key] = Graph(self, batch_size, capacity)
             return self.graphs[key](points, sample)
 
+    @torch.no_grad()
     def encode(self, points: Tensor, sample: Tensor, batch_size: int) -> list[Tensor]:
         """Pseudo-images, finest first, that hold until the next call."""
-        return self.encoder(points, sample, batch_size, self.dtype)
+        if self.fused is not None and self.is_fused(batch_size):
+            return self.fused(points, sample, batch_size, self.dtype)
+        return [image.to(self.dtype) for image in self.encoder(points, sample, batch_size)]
+
+    def is_fused(self, batch_size: int) -> bool:
+        """Whether the encoder runs as `FusedEncoder` for batches of this size."""
+        return is_fused(self.encoder, batch_size)
 
     def score(self, levels: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
         """The pyramid levels, and the scores (B, A) float32 of every class."""
@@ -240,7 +253,7 @@ def regress(level: Tensor, at: Tensor, weight: Tensor, anchors: int) -> Tensor:
 def load(checkpoint: str | Path | None = None, device: str = "auto") -> Detector:
     """A detector from a checkpoint of `python -m hvnet.train`, by default from the weights that come with the package.
 
-    Raises InputError naming the file.
+    device: auto (CUDA where there is a GPU), cpu, cuda or cuda:N. Raises InputError naming the file, or the device.
     """
     path = SHIPPED if checkpoint is None else checkpoint
     return Detector(model_from_checkpoint(load_checkpoint(path), str(path)), select_device(device))

@@ -1,4 +1,4 @@
-"""Pictures, drawn without a screen: clouds with boxes from above and in the camera's image, and pseudo-images.
+"""Pictures, drawn without a screen: clouds with boxes from above and in the camera's image.
 
 `show_*` draw into matplotlib axes, `draw_*` write a file: .png, or .svg and .pdf, in which the points are a raster.
 """
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PathCollection, PolyCollection
-from matplotlib.colors import AsinhNorm, to_rgba
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
@@ -20,8 +20,9 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hvnet.boxes import bev_corners, box_corners
-from hvnet.data.kitti import EDGES, NEAR, NO_IMAGE, Calibration, Floats, in_image, project_boxes, read_image
+from hvnet.boxes import EDGES, bev_corners, box_corners
+from hvnet.data.frame import Frame
+from hvnet.network.model import Detections
 
 FORMATS = ("png", "svg", "pdf")
 TRUTH_COLOUR = "#1a9850"
@@ -37,43 +38,15 @@ Colour = Literal["height", "reflectance"]
 
 
 class Subject(NamedTuple):
-    """What a picture shows, in LiDAR axes."""
+    """What a picture shows: a frame with its labels, and what a detector found in it."""
 
-    points: Tensor  # (N, 4) x, y, z, reflectance
-    truth: Tensor  # (T, 7) labelled boxes
-    boxes: Tensor  # (M, 7) detections
-    scores: Tensor  # (M,)
-    labels: Tensor  # (M,) index into the classes
-    classes: Sequence[str]
+    frame: Frame
+    found: Detections
+    classes: Sequence[str]  # of the detector; labels of others are not shown
 
     def at_score(self, score: float) -> "Subject":
         """Without the detections below a score."""
-        shown = self.scores >= score
-        return self._replace(boxes=self.boxes[shown], scores=self.scores[shown], labels=self.labels[shown])
-
-
-class Camera(NamedTuple):
-    """Where the camera stands, and what it saw."""
-
-    calib: Calibration
-    size: tuple[int, int]  # width, height in pixels
-    image: NDArray[np.uint8] | None  # (H, W, 3), None where there is none
-
-
-def camera_at(calib: Calibration, size: tuple[int, int], picture: Path | None) -> Camera | None:
-    """The camera of a frame, with its picture where that file is there; None without a camera."""
-    if size == NO_IMAGE:
-        return None
-    return Camera(calib, size, read_image(picture) if picture is not None and picture.is_file() else None)
-
-
-class Features(NamedTuple):
-    """The pseudo-images of a model for one cloud."""
-
-    name: str  # of the model
-    images: Sequence[Tensor]  # (B, C, N_L, N_W) each, of which the first sample is drawn
-    cells: Sequence[tuple[float, float]]  # length and width of a cell of each image, in metres
-    corner: tuple[float, float]  # least x and y of all images, in metres
+        return self._replace(found=self.found.select(self.found.scores >= score))
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
@@ -85,81 +58,25 @@ def draw_bev(path: Path, subject: Subject, point_range: Sequence[float], title: 
     axes = figure.add_subplot()
     _whole_bev(axes, subject.at_score(SHOWN_SCORE), point_range, colour)
     axes.set_title(f"{title}, score ≥ {SHOWN_SCORE}", parse_math=False)
-    _write(figure, path, dpi=110)
+    write_figure(figure, path, dpi=110)
 
 
 def draw_frame(
-    path: Path,
-    subject: Subject,
-    point_range: Sequence[float],
-    camera: Camera,
-    title: str,
-    colour: Colour = "height",
+    path: Path, subject: Subject, point_range: Sequence[float], title: str, colour: Colour = "height"
 ) -> None:
     """Writes the camera's picture above and the bird's eye view below, with detections from SHOWN_SCORE on."""
+    camera = subject.frame.camera
+    assert camera is not None
     heights = (0.92 * WIDTH * camera.size[1] / camera.size[0], 0.92 * _bev_height(point_range))  # labels take the rest
     figure = Figure(figsize=(WIDTH, 1.0 + sum(heights)), layout="compressed")
     above, below = figure.subplots(2, 1, height_ratios=heights)
     subject = subject.at_score(SHOWN_SCORE)
-    points = show_camera(above, subject, camera)
+    points = show_camera(above, subject)
     if points is not None:
         _colour_bar(points, above.inset_axes((0.77, 0.91, 0.2, 0.03)), "depth (m)")
     above.set_title(f"{title}, score ≥ {SHOWN_SCORE}", parse_math=False)
     _whole_bev(below, subject, point_range, colour)
-    _write(figure, path, dpi=150)
-
-
-def draw_features(path: Path, models: Sequence[Features], title: str) -> None:
-    """Writes the pseudo-images of one or several models: a row for each projection scale, finest first.
-
-    The columns are the first channel of every model, as in the paper, then the norm over the channels.
-    """
-    rows = max(len(model.images) for model in models)
-    width = max(3.4 * 2 * len(models), WIDTH)
-    figure = Figure(figsize=(width, 0.5 + 3.2 * rows), layout="compressed")
-    axes = figure.subplots(rows, 2 * len(models), squeeze=False)
-    for axis in axes.flat:
-        axis.axis("off")
-    for at, model in enumerate(models):
-        for row, (image, cell) in enumerate(zip(model.images, model.cells, strict=True)):
-            channels = image[0].detach().float().cpu()  # (C, N_L, N_W)
-            for column, values in ((at, channels[0]), (len(models) + at, channels.norm(dim=0))):
-                _show_feature(axes[row, column], values, cell, model.corner, column < len(models))
-                what = "first channel" if column < len(models) else "norm"
-                lines = f"{model.name}\n" if len(models) > 1 else ""
-                axes[row, column].set_title(f"{lines}{what}, cells of {cell[0]:g} m", fontsize=9, parse_math=False)
-    figure.suptitle(title, parse_math=False)
-    _write(figure, path, dpi=110)
-
-
-def _show_feature(
-    axes: Axes, values: Tensor, cell: tuple[float, float], corner: tuple[float, float], signed: bool
-) -> None:
-    """An image (N_L, N_W) as seen from above, up to the 99.5th percentile of what is not zero.
-
-    Below their median the values are coloured linearly, above by their logarithm: few cells hold the greatest.
-    """
-    length, width = (count * size for count, size in zip(values.shape, cell, strict=True))
-    x, y = corner
-    known = values[values != 0].abs().numpy()
-    median, most = np.percentile(known, (50, 99.5)) if len(known) else (1.0, 1.0)
-    image = axes.imshow(
-        values.flip(1).numpy(),
-        origin="lower",
-        extent=(-(y + width), -y, x, x + length),
-        cmap="RdBu_r" if signed else "magma",
-        norm=AsinhNorm(median, -most if signed else 0.0, most),
-        interpolation="nearest" if max(values.shape) < 300 else "antialiased",
-    )
-    axes.axis("on")
-    axes.tick_params(labelsize=7)
-    figure = axes.get_figure(root=True)
-    assert figure is not None
-    ticks = [0, median, most]
-    bar = figure.colorbar(image, ax=axes, shrink=0.8, pad=0.02, ticks=[-most, -median, *ticks] if signed else ticks)
-    bar.ax.yaxis.set_major_formatter("{x:.2g}")
-    bar.ax.tick_params(labelsize=7)
-    bar.minorticks_off()
+    write_figure(figure, path, dpi=150)
 
 
 # --- from above -------------------------------------------------------------------------------------------------------
@@ -172,7 +89,7 @@ def show_bev(axes: Axes, subject: Subject, point_range: Sequence[float], colour:
     outside the range are not drawn. Returns the points.
     """
     x_min, y_min, z_min, x_max, y_max, z_max = point_range
-    points = subject.points.cpu()
+    points = subject.frame.points.cpu()
     inside = (points[:, 0] >= x_min) & (points[:, 0] < x_max) & (points[:, 1] >= y_min) & (points[:, 1] < y_max)
     x, y, z, reflectance = points[inside].numpy().T
     values, limits = (z, (z_min, min(z_max, 1.0))) if colour == "height" else (reflectance, (0.0, 1.0))
@@ -232,33 +149,35 @@ def _outlines(boxes: Tensor, colour: str, width: float, label: str) -> LineColle
 # --- in the image -----------------------------------------------------------------------------------------------------
 
 
-def show_camera(axes: Axes, subject: Subject, camera: Camera) -> PathCollection | None:
+def show_camera(axes: Axes, subject: Subject) -> PathCollection | None:
     """Draws the camera's image with the boxes: edges, the face in front tinted, and the 2D box dotted.
 
     Without an image the points are drawn and returned, coloured by their depth. Nothing is drawn of what is behind the
     camera or outside the image.
     """
+    camera = subject.frame.camera
+    assert camera is not None
     width, height = camera.size
-    drawn = None
-    if camera.image is not None:
-        axes.imshow(camera.image, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
+    drawn, image = None, camera.read_image()
+    if image is not None:
+        axes.imshow(image, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
     else:
-        points = subject.points.cpu().numpy()
-        points = points[in_image(points, camera.calib, camera.size)]
-        pixels, depth = camera.calib.project(points[:, :3])
+        points = subject.frame.points.cpu().numpy()
+        points = points[camera.sees(points)]
+        pixels, depth = camera.project(points[:, :3])
         drawn = _scatter(axes, pixels[:, 0], pixels[:, 1], depth, (0.0, 60.0), "turbo", 1.5)
         axes.set_aspect("equal")
     for boxes, texts, tint, line_width, label in _groups(subject):
         values = boxes.double().numpy()
         corners = box_corners(boxes.double()).numpy()  # (M, 8, 3)
         begin, end = corners[:, EDGES[:, 0]].reshape(-1, 3), corners[:, EDGES[:, 1]].reshape(-1, 3)
-        lines, _ = project_lines(begin, end, camera.calib, camera.size)
-        halo = [withStroke(linewidth=line_width + 1.2, foreground=(1, 1, 1, 0.55))] if camera.image is not None else []
+        lines, _ = camera.project_lines(begin, end)
+        halo = [withStroke(linewidth=line_width + 1.2, foreground=(1, 1, 1, 0.55))] if image is not None else []
         edges = LineCollection(list(lines), colors=tint, linewidths=line_width, label=label, path_effects=halo)
         axes.add_collection(edges)
-        fronts = [project_polygon(each[FRONT], camera.calib, camera.size) for each in corners]
+        fronts = [camera.project_polygon(each[FRONT]) for each in corners]
         axes.add_collection(PolyCollection([face for face in fronts if len(face)], facecolors=to_rgba(tint, 0.18)))
-        bbox, visible = project_boxes(values, camera.calib, camera.size)
+        bbox, visible = camera.project_boxes(values)
         rectangles = bbox[visible][:, [[0, 1], [2, 1], [2, 3], [0, 3]]]  # (V, 4, 2)
         around = PolyCollection(list(rectangles), facecolors="none", edgecolors=tint, linewidths=0.7, linestyles=":")
         axes.add_collection(around)
@@ -271,49 +190,6 @@ def show_camera(axes: Axes, subject: Subject, camera: Camera) -> PathCollection 
     return drawn
 
 
-def project_lines(
-    begin: Floats, end: Floats, calib: Calibration, size: tuple[int, int]
-) -> tuple[Floats, NDArray[np.bool_]]:
-    """Pixels (K, 2, 2) of what the camera sees of lines from begin (S, 3) to end (S, 3), and which it sees (S,).
-
-    The lines are cut at the near plane and at the image's borders (Liang and Barsky 1984), all five of which are planes
-    through homogeneous pixels, before they are projected.
-    """
-    begin, end = calib.homogeneous(begin), calib.homogeneous(end)
-    a, b = _inside(begin, size), _inside(end, size)  # (S, 5)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = a / (a - b)
-    first = np.where((a < 0) & (b >= 0), share, 0).max(axis=1)[:, None]
-    last = np.where((a >= 0) & (b < 0), share, 1).min(axis=1)[:, None]
-    seen = ~((a < 0) & (b < 0)).any(axis=1) & (first < last)[:, 0]
-    parts = np.stack((begin + first * (end - begin), begin + last * (end - begin)), axis=1)[seen]  # (K, 2, 3)
-    return parts[..., :2] / parts[..., 2:], seen
-
-
-def project_polygon(corners: Floats, calib: Calibration, size: tuple[int, int]) -> Floats:
-    """Pixels (Q, 2) of what the camera sees of a convex polygon (P, 3), none if nothing (Sutherland and Hodgman)."""
-    polygon = calib.homogeneous(corners)
-    for plane in range(5):
-        values = _inside(polygon, size)[:, plane]
-        kept: list[Floats] = []
-        for k in range(len(polygon)):
-            before = k - 1
-            if (values[before] < 0) != (values[k] < 0):
-                share = values[before] / (values[before] - values[k])
-                kept.append(polygon[before] + share * (polygon[k] - polygon[before]))
-            if values[k] >= 0:
-                kept.append(polygon[k])
-        polygon = np.array(kept).reshape(-1, 3)
-    return polygon[:, :2] / polygon[:, 2:]
-
-
-def _inside(pixels: Floats, size: tuple[int, int]) -> Floats:
-    """Of homogeneous pixels (S, 3) how far inside they are of the near plane and the image's four borders: (S, 5)."""
-    width, height = size
-    u, v, depth = pixels.T
-    return np.column_stack((depth - NEAR, u, (width - 1) * depth - u, v, (height - 1) * depth - v))
-
-
 # --- for both ---------------------------------------------------------------------------------------------------------
 
 
@@ -321,11 +197,11 @@ def _groups(
     subject: Subject, point_range: Sequence[float] | None = None
 ) -> Iterator[tuple[Tensor, list[str], str, float, str]]:
     """Boxes (M, 7), their M scores as text, colour, width of line and name: the labels, then class by class."""
-    truth = subject.truth.cpu()
+    truth = subject.frame.boxes_of(subject.classes).cpu()
     truth = truth[_is_drawable(truth, point_range)]
     if len(truth):
         yield truth, [""] * len(truth), TRUTH_COLOUR, 2.2, "labelled"
-    boxes, scores, labels = subject.boxes.cpu(), subject.scores.cpu(), subject.labels.cpu()
+    boxes, scores, labels = (part.cpu() for part in subject.found)
     for label, name in enumerate(subject.classes):
         own = (labels == label) & _is_drawable(boxes, point_range)
         if own.any():
@@ -371,7 +247,7 @@ def _write_text(axes: Axes, x: float, y: float, text: str, colour: str, vertical
         axes.text(x, y, text, color=colour, fontsize=6.5, ha="center", va=vertical, clip_on=True, path_effects=halo)
 
 
-def _write(figure: Figure, path: Path, dpi: float) -> None:
+def write_figure(figure: Figure, path: Path, dpi: float) -> None:
     """Writes a figure in the format of the path's suffix, the same bits for the same figure."""
     path.parent.mkdir(parents=True, exist_ok=True)
     without_date = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(path.suffix)

@@ -1,15 +1,13 @@
-"""A page of what a detector gets wrong: `python -m hvnet.errors RUN`, one HTML file that opens from disk.
+"""A page of what a detector gets wrong: one HTML file that opens from disk, all pictures inside.
 
-It holds the evaluation of the validation split, the curves of the training, and the worst misses and false positives,
-each cut out of the bird's eye view and, with a camera, of its image. All pictures are inside the file.
+It holds the evaluation, the curves of the training, and the worst misses and false positives, each cut out of the
+bird's eye view and, with a camera, of its image.
 """
 
-import argparse
 import base64
 import io
-import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,14 +24,15 @@ from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
-from hvnet.cli import InputError, add_device, make_parser, run_command
-from hvnet.data.kitti import detections_to_labels, project_boxes, read_frame, read_split
-from hvnet.detector import Detector, load
-from hvnet.draw import CLASS_COLOURS, TRUTH_COLOUR, Camera, Subject, camera_at, show_bev, show_camera
-from hvnet.evaluate import CLASSES, MIN_OVERLAPS, evaluate, format_table
+from hvnet.data.frame import Frame, Frames
+from hvnet.evaluation.mistakes import MISS, Mistake, find_mistakes, worst
+from hvnet.evaluation.rules import Rule, config_rules
+from hvnet.evaluation.scoring import Detected, score
+from hvnet.evaluation.tables import format_table
 from hvnet.kernels.rotated import rotated_iou_bev
-from hvnet.mistakes import MISS, Mistake, find_mistakes, worst
-from hvnet.model import Detections
+from hvnet.network.detector import Detector
+from hvnet.network.model import Detections
+from hvnet.pictures.clouds import CLASS_COLOURS, TRUTH_COLOUR, Subject, show_bev, show_camera
 
 REACH = 8.0
 """Metres that a crop from above shows to every side of the box."""
@@ -108,51 +107,12 @@ score.</p>
 """
 
 
-class Run(NamedTuple):
-    """What there is of a training run."""
-
-    checkpoint: Path
-    metrics: list[dict[str, Any]]  # a record an epoch, none where there is no metrics.jsonl
-    root: Path | None  # the KITTI root that it was trained on, if the run says so
-
-
 class Crop(NamedTuple):
     """A mistake, its picture as a data URI, and what is to be said of it."""
 
     mistake: Mistake
     picture: str
     text: str
-
-
-def find_run(path: Path) -> Run:
-    """The run of a folder of hvnet.train, or of a checkpoint file. Raises InputError if it is neither."""
-    if path.is_dir() and not (path / "checkpoint.pt").is_file():
-        raise InputError(f"{path}: holds no checkpoint.pt; give the folder of a run of hvnet.train, or a checkpoint")
-    if not path.exists():
-        raise InputError(f"{path}: no such run; give the folder of a run of hvnet.train, or a checkpoint")
-    checkpoint = path / "checkpoint.pt" if path.is_dir() else path
-    data = checkpoint.parent / "data.txt"
-    try:
-        named = data.read_text(encoding="utf-8").strip() if data.is_file() else ""
-    except UnicodeDecodeError as error:
-        raise InputError(f"{data}: is no text that names a KITTI root; remove it, and give --data") from error
-    root = Path(named) if named else None
-    return Run(checkpoint, _read_metrics(checkpoint.parent / "metrics.jsonl"), root)
-
-
-def _read_metrics(path: Path) -> list[dict[str, Any]]:
-    records = []
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    for number, line in enumerate(lines, 1):
-        try:
-            record = json.loads(line)
-            record["epoch"]
-            for table in record.get("validation", {}).values():
-                table["exact"]
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InputError(f"{path}:{number}: no record of hvnet.train; remove the line") from error
-        records.append(record)
-    return records
 
 
 def draw_curves(metrics: Sequence[dict[str, Any]]) -> bytes:
@@ -184,8 +144,9 @@ def draw_curves(metrics: Sequence[dict[str, Any]]) -> bytes:
     return file.getvalue()
 
 
-def draw_crop(mistake: Mistake, subject: Subject, camera: Camera | None) -> bytes:
+def draw_crop(mistake: Mistake, subject: Subject) -> bytes:
     """The neighbourhood of a mistake from above, the box inside a dashed line, as PNG; left of it in the image."""
+    camera = subject.frame.camera
     wide = 2.8 if camera is None else 7.6
     figure = Figure(figsize=(wide, 2.7), dpi=120)
     # places in parts of the figure: 4.8 by 2.4 inches and 2.4 by 2.4; a layout that is found takes half as long again
@@ -197,8 +158,8 @@ def draw_crop(mistake: Mistake, subject: Subject, camera: Camera | None) -> byte
     above.add_patch(Circle((-y, x), math.hypot(length, width) / 2 + 0.4, **DASHED))
     if camera is not None:
         axes = figure.add_axes((0.05 / wide, 0.093, 4.8 / wide, 0.889))
-        show_camera(axes, subject, camera)
-        bbox, visible = project_boxes(mistake.box[None].numpy(), camera.calib, camera.size)
+        show_camera(axes, subject)
+        bbox, visible = camera.project_boxes(mistake.box[None].numpy())
         if visible[0]:
             _zoom_in(axes, bbox[0], camera.size)
     canvas, file = FigureCanvasAgg(figure), io.BytesIO()
@@ -250,18 +211,13 @@ def describe(mistake: Mistake, point_range: Sequence[float]) -> str:
     return f"{where}, {near if mistake.overlap > 0 else 'no detection of its class there'}"
 
 
-def make_crop(mistake: Mistake, detector: Detector, root: Path, found: Detections, min_score: float) -> Crop:
-    """Reads the mistake's frame again and draws it."""
-    frame = read_frame(root, mistake.frame)
-    path = root / "training" / "image_2" / f"{mistake.frame}.png"
-    camera = camera_at(frame.calib, frame.image_size, path)
+def make_crop(mistake: Mistake, detector: Detector, frame: Frame, found: Detections, min_score: float) -> Crop:
+    """Draws a mistake in its frame."""
     own = found.labels == detector.classes.index(mistake.name)
     shown = (found.scores >= min_score) | (own & (rotated_iou_bev(mistake.box[None], found.boxes)[0] > 0))
-    found = Detections(found.boxes[shown], found.scores[shown], found.labels[shown])
-    truth = frame.boxes[[name in detector.classes for name in frame.names]]
-    subject = Subject(frame.points, truth, *found, detector.classes)
+    subject = Subject(frame, found.select(shown), detector.classes)
     text = describe(mistake, detector.config.encoder.point_range)
-    return Crop(mistake, _data_uri("image/png", draw_crop(mistake, subject, camera)), text)
+    return Crop(mistake, _data_uri("image/png", draw_crop(mistake, subject)), text)
 
 
 def _data_uri(kind: str, content: bytes) -> str:
@@ -277,30 +233,39 @@ def summary_rows(result: dict[str, dict[str, Any]], measures: Sequence[str]) -> 
                 if metric in table["R40"]:
                     figures = [value for measure in measures for value in table[measure][metric]]
                     texts = ["-" if value is None else f"{value:.1f}" for value in figures]
-                    overlap = MIN_OVERLAPS[strictness][name][metric]
+                    overlap = scored["overlaps"][strictness][metric]
                     rows.append({"name": name, "metric": metric.upper(), "overlap": overlap, "figures": texts})
     return rows
 
 
-def make_page(run: Run, detector: Detector, root: Path, count: int, min_score: float) -> str:
-    """Detects in the validation split of a KITTI root, and writes the page, with `count` mistakes of each kind."""
-    scored = [name for name in detector.classes if name in CLASSES]
-    if not scored:
-        raise InputError(f"{run.checkpoint}: finds none of {', '.join(CLASSES)}, and no other class is scored")
-    names = read_split(root, "val")
+def make_page(
+    checkpoint: Path,
+    metrics: list[dict[str, Any]],
+    detector: Detector,
+    frames: Frames,
+    *,
+    of: str,
+    count: int,
+    min_score: float,
+    rules: Mapping[str, Rule] | None = None,
+) -> str:
+    """Detects in labelled frames, those `of` a data set, and writes the page, with `count` mistakes of each kind.
+
+    metrics: the records of the training, none if there are none.
+    """
+    rules = rules or config_rules(detector.config)
     detections: dict[str, Detections] = {}
-    labels, rows, mistakes = [], [], []
-    for name in tqdm(names, desc="detecting", unit="frame", dynamic_ncols=True):
-        frame = read_frame(root, name)
-        found = detections[name] = detector(frame.points)
-        classes = [detector.classes[label] for label in found.labels.tolist()]
-        labels.append(frame.labels)
-        rows.append(detections_to_labels(found.boxes, found.scores, classes, frame.calib, frame.image_size))
-        mistakes += find_mistakes(frame, found, detector.classes, min_score)
-    result = evaluate(labels, rows, classes=scored)
+    mistakes: list[Mistake] = []
+
+    def visit(detected: Detected) -> None:
+        detections[detected.frame.name] = detected.found
+        mistakes.extend(find_mistakes(detected.frame, detected.found, rules, min_score))
+
+    result = score(detector, frames, rules=rules, visit=visit, title="detecting")
     chosen = worst(mistakes, count)
     bar = tqdm([each for kind in chosen for each in kind], desc="drawing", unit="crop", dynamic_ncols=True)
-    crops = [make_crop(each, detector, root, detections[each.frame], min_score) for each in bar]
+    place = {name: k for k, name in enumerate(frames.names)}
+    crops = [make_crop(each, detector, frames[place[each.frame]], detections[each.frame], min_score) for each in bar]
     misses, false_positives = crops[: len(chosen[0])], crops[len(chosen[0]) :]
     measures = ("exact", "R40")
     in_all = sum(each.kind == MISS for each in mistakes)
@@ -308,9 +273,9 @@ def make_page(run: Run, detector: Detector, root: Path, count: int, min_score: f
         Environment(autoescape=True)
         .from_string(PAGE)
         .render(
-            checkpoint=run.checkpoint,
-            root=root,
-            frames=len(names),
+            checkpoint=checkpoint,
+            root=of,
+            frames=len(frames),
             min_score=f"{min_score:g}",
             misses_in_all=in_all,
             false_positives_in_all=len(mistakes) - in_all,
@@ -318,7 +283,7 @@ def make_page(run: Run, detector: Detector, root: Path, count: int, min_score: f
             levels=next(iter(result.values()))["levels"],
             rows=summary_rows(result, measures),
             table=format_table(result),
-            curves=_data_uri("image/svg+xml", draw_curves(run.metrics)) if run.metrics else None,
+            curves=_data_uri("image/svg+xml", draw_curves(metrics)) if metrics else None,
             truth_colour=TRUTH_COLOUR,
             colours=list(zip(detector.classes, CLASS_COLOURS * len(detector.classes), strict=False)),
             sections=[
@@ -327,62 +292,3 @@ def make_page(run: Run, detector: Detector, root: Path, count: int, min_score: f
             ],
         )
     )
-
-
-def _share(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"{text} is no score: want a number from 0 to 1")
-    return value
-
-
-def _positive(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text} is no count: want 1 or more")
-    return int(text)
-
-
-def main(arguments: Sequence[str] | None) -> None:
-    """The command."""
-    parser = make_parser(
-        "errors",
-        "Writes a page (HTML, all pictures inside) of a run: its evaluation in the validation split, its curves, and "
-        "the worst misses and false positives, from above and, with a camera, in the image.",
-        [
-            "runs/demo",
-            "runs/compact --data /data/kitti --count 50 --min-score 0.3",
-            "model.pt --data /data/kitti --out model.html",
-        ],
-    )
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run of hvnet.train, or a checkpoint")
-    parser.add_argument("--data", type=Path, metavar="DIR", help="a KITTI root (default: the one that the run names)")
-    parser.add_argument(
-        "--out", type=Path, metavar="FILE", help="(default: errors.html in the run's folder, or here for a checkpoint)"
-    )
-    parser.add_argument("--count", type=_positive, default=20, metavar="N", help="of each kind (default: 20)")
-    parser.add_argument(
-        "--min-score", type=_share, default=0.5, metavar="X", help="detections below do not count (default: 0.5)"
-    )
-    add_device(parser)
-    options = parser.parse_args(arguments)
-
-    run = find_run(options.run)
-    root = options.data or run.root
-    if root is None:
-        raise InputError(f"{options.run}: does not name the data that it was trained on; give a KITTI root with --data")
-    out = options.out or (options.run if options.run.is_dir() else Path()) / "errors.html"
-    if out.is_dir():
-        raise InputError(f"{out}: is a folder; --out names the page, such as {out / 'errors.html'}")
-    if not out.parent.is_dir() and (out.parent.exists() or not out.parent.parent.is_dir()):
-        raise InputError(f"{out.parent}: no folder; --out names the page, such as errors.html")
-    page = make_page(run, load(run.checkpoint, options.device), root, options.count, options.min_score)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(page, encoding="utf-8")
-    print(f"page: {out}")
-
-
-if __name__ == "__main__":
-    run_command(main)

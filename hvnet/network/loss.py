@@ -6,11 +6,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from hvnet.anchors import Targets, decode
 from hvnet.boxes import bev_corners
 from hvnet.config import ClassConfig, LossConfig
-from hvnet.head import HeadMaps
-from hvnet.ranks import joined
+from hvnet.network.anchors import Targets, decode
+from hvnet.network.head import HeadMaps
+from hvnet.ranks import all_reduce
 
 
 def focal_loss(logits: Tensor, positive: Tensor, negative: Tensor, alpha: float, gamma: float) -> Tensor:
@@ -22,7 +22,7 @@ def focal_loss(logits: Tensor, positive: Tensor, negative: Tensor, alpha: float,
 
 def class_loss(maps: HeadMaps, targets: Targets, entry: ClassConfig, weights: LossConfig) -> dict[str, Tensor]:
     """The weighted terms of one class, each divided by max(1, positives of the class in the batch of all ranks)."""
-    positives = joined(targets.positive.sum()).clamp(min=1)
+    positives = all_reduce(targets.positive.sum()).clamp(min=1)
     focal = focal_loss(maps.logits, targets.positive, targets.negative, entry.focal_alpha, entry.focal_gamma)
     at = targets.positive
     smooth_l1 = functools.partial(F.smooth_l1_loss, reduction="sum", beta=weights.beta)

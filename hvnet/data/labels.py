@@ -1,0 +1,71 @@
+"""The rows of KITTI's label and result files, which its evaluation compares."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+DONTCARE = "DontCare"
+"""The class of a region of the image where nothing is labelled."""
+
+
+@dataclass(frozen=True)
+class Labels:
+    """K objects of one label or result file, as in the file: camera axes, metres, pixels, radians."""
+
+    name: NDArray[np.str_]  # (K,)
+    truncation: Floats  # (K,) 0 to 1, the share outside the image; -1 unknown
+    occlusion: NDArray[np.int64]  # (K,) 0 visible, 1 partly, 2 largely occluded, 3 unknown; -1 in result files
+    alpha: Floats  # (K,) observation angle
+    bbox: Floats  # (K, 4) left, top, right, bottom
+    dimensions: Floats  # (K, 3) height, width, length
+    location: Floats  # (K, 3) centre of the bottom
+    rotation_y: Floats  # (K,)
+    score: Floats | None = None  # (K,) only in result files
+
+    def __len__(self) -> int:
+        return len(self.name)
+
+    def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "Labels":
+        """The rows that a mask or an index array picks."""
+        columns: dict[str, Any] = {}
+        for field in fields(self):
+            column = getattr(self, field.name)
+            columns[field.name] = None if column is None else column[rows]
+        return Labels(**columns)
+
+    def bev_boxes(self) -> Floats:
+        """Boxes (K, 7) in upright axes of their own, for overlaps alone: z counts down from the camera's height."""
+        height, width, length = self.dimensions.T
+        x, y, z = self.location.T  # y points down, hence the minus of the angle
+        return np.column_stack((x, z, y - height / 2, length, width, height, -self.rotation_y))
+
+    def vertical(self) -> tuple[Floats, Floats]:
+        """Top and bottom (K,) of the boxes, counted downwards."""
+        bottom = self.location[:, 1]
+        return bottom - self.dimensions[:, 0], bottom
+
+    def ground_distance(self) -> Floats:
+        """Distance (K,) from the camera on the ground, in metres."""
+        return np.hypot(self.location[:, 0], self.location[:, 2])
+
+
+def concatenate(parts: Sequence[Labels]) -> Labels:
+    """The rows of all parts; scores only if all have them."""
+    columns: dict[str, Any] = {}
+    for field in fields(Labels):
+        arrays = [getattr(part, field.name) for part in parts]
+        columns[field.name] = None if any(array is None for array in arrays) else np.concatenate(arrays)
+    return Labels(**columns)
+
+
+def no_results() -> Labels:
+    """The rows of a result file in which nothing is found."""
+    none = np.empty(0)
+    whole = np.empty(0, np.int64)
+    three = np.empty((0, 3))
+    return Labels(np.empty(0, np.str_), none, whole, none, np.empty((0, 4)), three, three, none, score=none)

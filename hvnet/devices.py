@@ -1,0 +1,32 @@
+"""The device to run on, and what it is called."""
+
+import platform
+from pathlib import Path
+
+import torch
+
+from hvnet.exceptions import InputError
+
+
+def select_device(name: str) -> torch.device:
+    """The device named auto, cpu or cuda (or cuda:1, ...); auto is CUDA where there is a GPU. Raises InputError."""
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise InputError(f"device {name}: torch sees no CUDA device; use cpu")
+    if name.partition(":")[0] not in ("cpu", "cuda"):
+        raise InputError(f"device {name}: want auto, cpu or cuda")
+    try:
+        return torch.device(name)
+    except RuntimeError as error:
+        raise InputError(f"device {name}: want auto, cpu, cuda or cuda:N") from error
+
+
+def device_name(device: torch.device) -> str:
+    """What a device is called: the GPU's or the processor's name."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

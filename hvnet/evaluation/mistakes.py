@@ -1,0 +1,104 @@
+"""What a detector gets wrong in labelled frames: objects that it misses, and boxes where nothing is labelled."""
+
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hvnet.boxes import points_in_boxes
+from hvnet.data.frame import Frame
+from hvnet.data.kitti import frame_labels
+from hvnet.data.labels import DONTCARE
+from hvnet.evaluation.rules import Rule
+from hvnet.kernels.rotated import rotated_iou_bev
+from hvnet.network.model import Detections
+
+MISS, FALSE_POSITIVE = "miss", "false positive"
+
+
+class Mistake(NamedTuple):
+    """A labelled box that is not found, or a detection that is none."""
+
+    frame: str
+    kind: str  # MISS or FALSE_POSITIVE
+    name: str  # the class
+    box: Tensor  # (7,) float32, LiDAR axes
+    score: float  # of the detection; for a miss that of the detection of its class with the best overlap, 0 for none
+    distance: float  # of the box's centre from the LiDAR on the ground, in metres
+    points: int  # of the frame's cloud, inside the box
+    overlap: float  # best BEV IoU with a detection (for a miss) or a label (for a false positive) of the class
+
+
+def find_mistakes(frame: Frame, detections: Detections, rules: Mapping[str, Rule], min_score: float) -> list[Mistake]:
+    """The mistakes of the detections in a labelled frame, misses first, class by class.
+
+    `rules` are those of the classes, in the order that the detections' labels (M,) number.
+
+    A labelled box of one of the classes is missed if no detection of its class with score >= min_score reaches the BEV
+    IoU of the class's rule. A miss with an overlap above it was found, with a lower score.
+
+    A detection with score >= min_score is a false positive if it reaches that IoU with no label of its class, unless
+    KITTI does not score it: where a Van lies under a Car or a Person_sitting under a Pedestrian, where more than half
+    of its 2D box is in a DontCare region, or where none of it is in the image.
+    """
+    unscored = torch.zeros(len(detections.boxes), dtype=torch.bool)
+    if frame.camera is not None:
+        labels = frame_labels(frame)
+        bbox, visible = frame.camera.project_boxes(detections.boxes.double().numpy())
+        regions = labels.bbox[labels.name == DONTCARE]
+        unscored = torch.from_numpy(~visible | (_largest_share(bbox, regions) > 0.5))
+    found: dict[str, list[Mistake]] = {MISS: [], FALSE_POSITIVE: []}
+
+    def note(kind: str, name: str, boxes: Tensor, scores: Tensor, overlaps: Tensor) -> None:
+        points = points_in_boxes(frame.points, boxes).sum(dim=0)
+        distances = torch.linalg.vector_norm(boxes[:, :2], dim=1)
+        rows = zip(boxes, *(column.tolist() for column in (scores, distances, points, overlaps)), strict=True)
+        found[kind] += [Mistake(frame.name, kind, name, *row) for row in rows]
+
+    for label, (name, rule) in enumerate(rules.items()):
+        enough = rule.strict["bev"]
+        own = detections.labels == label
+        boxes, scores, left_out = detections.boxes[own], detections.scores[own], unscored[own]
+        counts = scores >= min_score
+        truth = frame.boxes_of([name])
+        iou = rotated_iou_bev(truth, boxes)  # (T, M_own)
+
+        missed = _largest(iou[:, counts], dim=1)[0] < enough
+        overlaps, best = _largest(iou, dim=1)
+        score_of_best = torch.where(overlaps > 0, scores[best] if len(scores) else 0.0, 0.0)
+        note(MISS, name, truth[missed], score_of_best[missed], overlaps[missed])
+
+        overlaps, _ = _largest(iou, dim=0)
+        if rule.neighbour is not None and rule.neighbour not in rules:
+            near, _ = _largest(rotated_iou_bev(frame.boxes_of([rule.neighbour]), boxes), dim=0)
+            left_out = left_out | (near >= enough)
+        wrong = counts & (overlaps < enough) & ~left_out
+        note(FALSE_POSITIVE, name, boxes[wrong], scores[wrong], overlaps[wrong])
+    return found[MISS] + found[FALSE_POSITIVE]
+
+
+def worst(mistakes: Iterable[Mistake], count: int) -> tuple[list[Mistake], list[Mistake]]:
+    """The first `count` misses, those with the most points in the box first, and false positives, best score first."""
+    both = list(mistakes)
+    misses = sorted((each for each in both if each.kind == MISS), key=lambda each: -each.points)
+    false_positives = sorted((each for each in both if each.kind == FALSE_POSITIVE), key=lambda each: -each.score)
+    return misses[:count], false_positives[:count]
+
+
+def _largest(iou: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+    """The largest value along a dimension and its index, both 0 where that dimension is empty."""
+    if iou.shape[dim]:
+        values, at = iou.max(dim=dim)
+        return values, at
+    none = iou.sum(dim=dim)
+    return none, none.long()
+
+
+def _largest_share(bbox: NDArray[np.float64], regions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The largest share of each 2D box (M, 4) that lies in one of the regions (R, 4): (M,)."""
+    size = np.minimum(bbox[:, None, 2:], regions[:, 2:]) - np.maximum(bbox[:, None, :2], regions[:, :2])  # (M, R, 2)
+    area = (bbox[:, 2:] - bbox[:, :2]).prod(axis=1)
+    return size.clip(min=0).prod(axis=2).max(axis=1, initial=0) / np.where(area > 0, area, 1)

@@ -1,0 +1,275 @@
+"""KITTI's object evaluation: AP in 2D, bird's eye view and 3D, and AOS, of results of any detector and any class.
+
+The protocol is that of the official C++ devkit (evaluate_object_3d_offline; Geiger et al., CVPR 2012), with 40 and
+with 11 recall positions. `exact` is the area under the interpolated precision-recall curve of all detections: the
+devkit takes at most one score a ground truth, so with n <= 40 of them no detector gets past (n - 1) / 40 in its R40.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hvnet.boxes import points_in_boxes
+from hvnet.data.frame import Camera
+from hvnet.data.kitti import boxes_to_lidar
+from hvnet.data.labels import DONTCARE, Labels
+from hvnet.evaluation.matching import (
+    LEVELS,
+    LEVELS_WITHOUT_2D,
+    Candidates,
+    Counts,
+    Floats,
+    Integers,
+    Level,
+    Mask,
+    Matching,
+    clean_data,
+    count,
+    find_candidates,
+    found_scores,
+    match_at,
+    select_truths,
+)
+from hvnet.evaluation.rules import KITTI, METRICS, Rule, rule_for
+
+MEASURES = ("R40", "R11", "exact")
+RECALL_STEPS = 40
+CURVE_STEPS = 200
+DISTANCES = {"0-20 m": (0, 20), "20-40 m": (20, 40), "40-60 m": (40, 60)}
+POINT_COUNTS = {"0-9 points": (0, 10), "10-49": (10, 50), "50-199": (50, 200), "200 or more": (200, math.inf)}
+
+
+def evaluate(
+    labels: Sequence[Labels],
+    predictions: Sequence[Labels],
+    *,
+    classes: Sequence[str] = tuple(KITTI),
+    rules: Mapping[str, Rule] | None = None,
+    levels: Sequence[Level] | None = None,
+    score_threshold: float | None = None,
+    points: Sequence[Integers] | None = None,
+) -> dict[str, dict[str, Any]]:
+    """Scores the predictions for frames against their labels; one `Labels` a frame in both.
+
+    For every class: `R40`, `R11` and `exact`, in each `2d`, `aos`, `bev` and `3d` (those that the boxes allow), in each
+    a list of one figure in per cent for every level, None where there is no ground truth; `loose`, the same at the
+    loose overlaps; `overlaps`, these by strictness and metric; `levels`, their names; `counts`; `report`, what is
+    missed and what is found wrongly at one score, `score_threshold` or that of the best F1; `warnings`; and `curves`,
+    for strict and loose overlaps and every metric one `Counts` a level, thinned to CURVE_STEPS.
+
+    `rules` are by default KITTI's for its classes; for others they follow from the length of the labelled objects
+    (`rule_for`). `levels` are by default KITTI's, without their least height in the image where no label has a 2D box.
+    `points` are for every frame the numbers of points in the boxes of its labels (K,), see `count_points`; without them
+    the report's recall by points is None.
+    """
+    if len(labels) != len(predictions):
+        raise ValueError(f"predictions: want one for each of the {len(labels)} labels, got {len(predictions)}")
+    if not labels:
+        raise ValueError("labels: want at least one frame, got none")
+    if points is not None and [len(frame) for frame in points] != [len(frame) for frame in labels]:
+        raise ValueError("points: want one number for every row of every frame's labels, DontCare too")
+    candidates = find_candidates(labels, predictions)
+    notes = []
+    if levels is None:
+        levels = LEVELS
+        if not _has(candidates.truths if len(candidates.truths) else candidates.detections, "2d"):
+            levels = LEVELS_WITHOUT_2D
+            notes = ["no label has a 2D box: the levels go by occlusion and truncation alone"]
+    all_points = None if points is None else np.concatenate(points)
+    result = {}
+    for name in classes:
+        rule = (rules or {}).get(name) or rule_for(name, _median_length(candidates, name))
+        notes_of_class = []
+        if rule.neighbour in classes:
+            notes_of_class = [f"{rule.neighbour} is scored itself, so that a {name} found there is wrong"]
+            rule = rule._replace(neighbour=None)
+        result[name] = _evaluate_class(candidates, name, rule, levels, score_threshold, all_points)
+        result[name]["counts"]["frames"] = len(labels)
+        result[name]["warnings"] = notes + notes_of_class + result[name]["warnings"]
+    return result
+
+
+def _median_length(candidates: Candidates, name: str) -> float:
+    """Of the labelled objects of a class, of the detections where there are none; metres."""
+    for rows in (candidates.truths, candidates.detections):
+        lengths = rows.dimensions[rows.name == name, 2]
+        if (lengths > 0).any():
+            return float(np.median(lengths[lengths > 0]))
+    return 0.0
+
+
+def count_points(points: NDArray[np.float32], labels: Labels, camera: Camera | None) -> Integers:
+    """How many of the points (N, 4) in LiDAR axes lie in the box of each label: (K,), 0 for DontCare."""
+    objects = labels.name != DONTCARE
+    boxes = torch.from_numpy(boxes_to_lidar(labels.select(objects), camera))
+    counts = np.zeros(len(labels), np.int64)
+    counts[objects] = points_in_boxes(torch.from_numpy(points), boxes).sum(dim=0).numpy()
+    return counts
+
+
+def _evaluate_class(
+    candidates: Candidates,
+    name: str,
+    rule: Rule,
+    levels: Sequence[Level],
+    score_threshold: float | None,
+    points: Integers | None,
+) -> dict[str, Any]:
+    truths = candidates.truths.select(candidates.truths.name == name)
+    detections = candidates.detections.select(candidates.detections.name == name)
+    metrics = [metric for metric in METRICS if _has(truths, metric) and _has(detections, metric)]
+    oriented = not (detections.alpha == -10).any()  # the devkit's mark of an unknown angle
+    tables: dict[str, Any] = {}
+    curves: dict[str, dict[str, list[Counts]]] = {}
+    for strictness, overlaps in (("strict", rule.strict), ("loose", rule.loose)):
+        table: dict[str, dict[str, list[float | None]]] = {measure: {} for measure in MEASURES}
+        curves[strictness] = {metric: [] for metric in metrics}
+        for metric in metrics:
+            for level in levels:
+                matching = clean_data(candidates, name, metric, overlaps[metric], level, rule.neighbour)
+                counts = count(matching, candidates)
+                samples = _samples(matching, counts, found_scores(matching, candidates))
+                quality = {metric: counts.precision}
+                if metric == "2d" and oriented:
+                    quality["aos"] = counts.orientation
+                for key, values in quality.items():
+                    for measure, average in _averages(counts.recall, values, samples).items():
+                        found = average if matching.truths.any() else None
+                        table[measure].setdefault(key, []).append(found)
+                curves[strictness][metric].append(_thin(counts))
+        tables[strictness] = table
+    truth_counts = [int(select_truths(candidates.truths, name, level).sum()) for level in levels]
+    report = None
+    if metrics:
+        metric = metrics[-1]
+        overlap = rule.strict[metric]
+        matchings = [clean_data(candidates, name, metric, overlap, level, rule.neighbour) for level in levels]
+        chosen_by = "best F1" if score_threshold is None else "given"
+        threshold = _best_score(curves["strict"][metric]) if score_threshold is None else score_threshold
+        report = {"metric": metric, "overlap": overlap, "score_threshold": threshold, "chosen_by": chosen_by}
+        report |= _report(candidates, matchings, threshold, points)
+    return {
+        **tables["strict"],
+        "loose": tables["loose"],
+        "overlaps": {"strict": dict(rule.strict), "loose": dict(rule.loose)},
+        "levels": [level.name for level in levels],
+        "counts": {"ground_truths": truth_counts, "detections": len(detections)},
+        "report": report,
+        "warnings": _warnings(truths, detections, levels, truth_counts),
+        "curves": curves,
+    }
+
+
+def _has(labels: Labels, metric: str) -> bool:
+    """Whether boxes of this kind are given: at least once, as in the devkit, or nothing is given at all."""
+    if metric == "2d":
+        given = (labels.bbox[:, 0] >= 0) & (labels.bbox[:, 2:] > labels.bbox[:, :2]).all(axis=1)
+    elif metric == "bev":
+        given = (labels.location[:, [0, 2]] != -1000).all(axis=1) & (labels.dimensions[:, 1:] > 0).all(axis=1)
+    else:
+        given = (labels.location != -1000).all(axis=1) & (labels.dimensions > 0).all(axis=1)
+    return bool(given.any()) or not len(labels)
+
+
+def _samples(matching: Matching, counts: Counts, scores: Floats) -> Integers:
+    """Rows of the counts (at most 41,) at the devkit's thresholds.
+
+    Of the true positives' scores, highest first, those whose recall is nearest to 0, 1/40, 2/40, ...
+    """
+    total = matching.truths.sum()
+    chosen, target = [], 0.0
+    for k, score in enumerate(scores):
+        last = k == len(scores) - 1
+        recall, following = (k + 1) / total, (k + 2) / total
+        if last or following - target >= target - recall:
+            chosen.append(score)
+            target += 1 / RECALL_STEPS
+    return np.searchsorted(-counts.score, -np.array(chosen))
+
+
+def best_to_the_right(values: Floats) -> Floats:
+    """The greatest of each value and those after it: interpolated precision, (S,) by rising recall."""
+    return np.maximum.accumulate(values[::-1])[::-1]
+
+
+def _averages(recall: Floats, values: Floats, samples: Integers) -> dict[str, float]:
+    """Averages over recall, in per cent, of precision or orientation (S,): sampled as the devkit does, and exact."""
+    sampled = np.zeros(RECALL_STEPS + 1)
+    sampled[: len(samples)] = best_to_the_right(values[samples])
+    order = np.argsort(recall, kind="stable")
+    area = np.diff(recall[order], prepend=0) @ best_to_the_right(values[order])
+    averages = {"R40": sampled[1:].mean(), "R11": sampled[::4].mean(), "exact": area}
+    return {measure: 100 * float(average) for measure, average in averages.items()}
+
+
+def _thin(counts: Counts) -> Counts:
+    """The counts where recall first reaches each of CURVE_STEPS steps; with fewer ground truths, each of theirs."""
+    steps = np.floor(counts.recall * CURVE_STEPS + 1e-9)
+    return counts.select(np.flatnonzero(np.diff(np.maximum.accumulate(steps), prepend=0) > 0))
+
+
+def _best_score(curves: Sequence[Counts]) -> float:
+    """The score of the best F1 at the middle level, else at the first level where something is found."""
+    for curve in (curves[len(curves) // 2], *curves):
+        if len(curve.score):
+            wrong = curve.false_positives + curve.misses
+            f1 = 2 * curve.true_positives / (2 * curve.true_positives + wrong)
+            return float(curve.score[f1.argmax()])
+    return 0.0
+
+
+def _report(
+    candidates: Candidates, matchings: Sequence[Matching], threshold: float, points: Integers | None
+) -> dict[str, Any]:
+    """What is missed and what is found wrongly when the detections below a score are dropped."""
+    counts: dict[str, list[int]] = {"ground_truths": [], "misses": [], "false_positives": []}
+    distance = candidates.truths.ground_distance()
+    groups = {"recall_by_distance": {band: _between(distance, limits) for band, limits in DISTANCES.items()}}
+    if points is not None:
+        groups["recall_by_points"] = {band: _between(points, limits) for band, limits in POINT_COUNTS.items()}
+    recalls: dict[str, Any] = {"recall_by_distance": {}, "recall_by_points": None if points is None else {}}
+    for matching in matchings:
+        matched, taken = match_at(matching, candidates, threshold)
+        missed = matching.truths & (matched < 0)
+        found = matching.truths & (matched >= 0)
+        found[found] = ~matching.ignored[matched[found]]
+        wrong = matching.countable & (candidates.score >= threshold) & ~taken
+        counts["ground_truths"].append(int(matching.truths.sum()))
+        counts["misses"].append(int(missed.sum()))
+        counts["false_positives"].append(int(wrong.sum()))
+        for group, bands in groups.items():
+            for band, inside in bands.items():
+                row = recalls[group].setdefault(band, {"ground_truths": [], "recall": []})
+                hits, total = int((found & inside).sum()), int(((found | missed) & inside).sum())
+                row["ground_truths"].append(total)
+                row["recall"].append(100 * hits / total if total else None)
+    return {**counts, **recalls}
+
+
+def _between(values: NDArray, limits: tuple[float, float]) -> Mask:
+    return (values >= limits[0]) & (values < limits[1])
+
+
+def _warnings(truths: Labels, detections: Labels, levels: Sequence[Level], counts: Sequence[int]) -> list[str]:
+    """What a reader of the figures has to know; truths and detections are those of the class."""
+    warnings = []
+    if any(level.min_height > 0 for level in levels):
+        for objects, kind in ((truths, "label"), (detections, "detection")):
+            if len(objects) and not _has(objects, "2d"):
+                warnings.append(f"no {kind} has a 2D box, as these levels ask: see hvnet.evaluate --no-2d-filter")
+        flat = int((truths.bbox[:, 3] <= truths.bbox[:, 1]).sum())
+        if 0 < flat < len(truths):
+            of = f"{flat} of {len(truths)} labels have"
+            warnings.append(f"{of} no 2D box, as these levels ask: see hvnet.evaluate --no-2d-filter")
+    for level, total in zip(levels, counts, strict=True):
+        if 0 < total <= RECALL_STEPS:
+            # one threshold a ground truth at most, the first of which stands at recall 0
+            best = (100 * (total - 1) / RECALL_STEPS, 100 * math.ceil(total / 4) / 11)
+            warnings.append(
+                f"{level.name}: {total} ground truths cap R40 at {best[0]:.2f} and R11 at {best[1]:.2f}: read 'exact'"
+            )
+    return warnings

@@ -1,0 +1,1 @@
+"""The network, from points to boxes: grids, encoder, backbone, anchors, head, loss, model, detector."""

@@ -1,0 +1,1 @@
+"""Pictures of clouds, boxes and pseudo-images, the page of mistakes, and the viewer's page."""

@@ -1,0 +1,1 @@
+"""The paper's tables and figures: what they are, their rows, and what is written."""

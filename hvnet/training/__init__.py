@@ -1,0 +1,1 @@
+"""Training: the batches, and a run."""

@@ -1,0 +1,204 @@
+"""Training frames, augmented, in batches whose order depends on seed and epoch alone."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset, Sampler
+from tqdm import tqdm
+
+from hvnet import ranks
+from hvnet.config import Config
+from hvnet.data.augment import Objects, augment, mix_sectors
+from hvnet.data.frame import Frame, Frames, object_names
+from hvnet.data.gt_database import Database, build_database, load_database
+from hvnet.data.kitti import read_split_frames
+from hvnet.data.scenes.files import generate
+from hvnet.data.scenes.street import Options
+from hvnet.exceptions import InputError
+
+
+@dataclass(frozen=True)
+class Data:
+    """What a run trains and validates on."""
+
+    train: Frames
+    val: Frames
+    root: Path | None = None  # the KITTI root that they are from: it keeps the ground-truth database
+
+
+def kitti_data(root: Path, config: Config) -> Data:
+    """The frames of the config's splits in a KITTI root."""
+    train, val = config.train.train_split, config.train.val_split
+    return Data(read_split_frames(root, train), read_split_frames(root, val), root)
+
+
+def generated_scenes(config: Config, folder: Path) -> Path:
+    """A KITTI root in the folder, of the scenes that the config asks for; what is there already is taken."""
+    assert config.synthetic is not None
+    scenes, reach, seed = config.synthetic, config.encoder.point_range[3], config.train.seed
+    root = folder / f"scenes-{scenes.train_frames}-{scenes.val_frames}-{reach:g}m-{seed}"
+    generate(root, scenes.train_frames, scenes.val_frames, seed, Options(distance=(4.0, min(reach - 2, 80.0))))
+    return root
+
+
+def training_objects(data: Data, good: Sequence[int], say: Callable[..., None]) -> Database:
+    """The ground-truth database of the training frames that can be read: that of the KITTI root, or a new one."""
+    if data.root is not None:
+        return load_database(data.root, [data.train.names[k] for k in good], data.val.names, say)
+    return build_database(data.train, good)
+
+
+class Batch(NamedTuple):
+    """Several frames in one: all points, the sample of each, and the boxes of every sample."""
+
+    points: Tensor  # (N, 4)
+    sample: Tensor  # (N,) int64
+    boxes: list[Tensor]  # (M_b, 7) each
+    labels: list[Tensor]  # (M_b,) int64 each, index into the config's classes
+    notes: list[str]  # what is to be said of the frames' files, once
+    names: list[str]  # of the frames
+
+    def to(self, device: torch.device) -> "Batch":
+        """The batch on a device."""
+        boxes, labels = [b.to(device) for b in self.boxes], [each.to(device) for each in self.labels]
+        return self._replace(points=self.points.to(device), sample=self.sample.to(device), boxes=boxes, labels=labels)
+
+
+class Sample(NamedTuple):
+    """One frame."""
+
+    points: Tensor  # (N, 4), on a GPU where it is trained on one
+    boxes: Tensor  # (M, 7)
+    labels: Tensor  # (M,) int64, index into the config's classes, or -1
+    note: str
+    name: str
+
+
+class TrainingFrames(Dataset[Sample | InputError]):
+    """Frames augmented on a device; item (epoch, k) depends on the seed, the epoch and k alone.
+
+    A mistake in a file is returned, not raised: a worker process would wrap it in the text of its traceback.
+    """
+
+    def __init__(self, frames: Frames, config: Config, objects: Objects | None, device: torch.device) -> None:
+        self.frames, self.config, self.objects, self.device = frames, config, objects, device
+        self.classes = [entry.name for entry in config.head.classes]
+        self.kept: dict[int, Sample] = {}
+
+    def __getitem__(self, item: tuple[int, int]) -> Sample | InputError:
+        try:
+            return self.augmented(*item)
+        except InputError as error:
+            return error
+
+    def augmented(self, epoch: int, k: int) -> Sample:
+        """Frame k as it is trained on in an epoch."""
+        options = self.config.augment
+        generator = seeded(self.config.train.seed, epoch, k)
+        frame = self.read(k % len(self.frames))
+        points, boxes, labels, note = frame.points, frame.boxes, frame.labels, frame.note
+        if options.mix and torch.rand((), generator=generator).item() < options.mix:
+            other = self.read(int(torch.randint(len(self.frames), (), generator=generator)))
+            others = (other.points, other.boxes, other.labels)
+            points, boxes, labels = mix_sectors(points, boxes, labels, others, generator)
+            note = "\n".join(filter(None, (note, other.note)))
+        points, boxes, labels = augment(points, boxes, labels, self.objects, options, generator, self.classes)
+        low, high = boxes.new_tensor(self.config.encoder.point_range).view(2, 3)
+        inside = ((boxes[:, :2] >= low[:2]) & (boxes[:, :2] < high[:2])).all(dim=1) & (labels >= 0)
+        return Sample(points, boxes[inside], labels[inside], note, frame.name)
+
+    def read(self, k: int) -> Sample:
+        """Frame k as it is; boxes of classes that are not trained have label -1.
+
+        Where frames that cannot be read are to be skipped, the next one that can be takes the place.
+        """
+        if k in self.kept:
+            return self.kept[k]
+        notes: list[str] = []
+        for at in [*range(k, len(self.frames)), *range(k)]:
+            try:
+                frame = self.frames[at]
+                break
+            except (InputError, OSError) as error:
+                if not self.config.train.skip_corrupt:
+                    raise error if isinstance(error, InputError) else InputError(str(error)) from error
+                notes.append(f"frame {self.frames.names[at]} is skipped: {error}")
+        else:
+            raise InputError(f"no frame can be read; the last: {notes[-1]}")
+        sample = self.sample_of(frame, "\n".join([*notes, *frame.notes]))
+        if self.config.train.workers == 0:  # read once; several workers would each keep all frames
+            self.kept[k] = sample
+        return sample
+
+    def sample_of(self, frame: Frame, note: str) -> Sample:
+        """The frame on the device, its classes by number."""
+        boxes, names = (torch.zeros(0, 7), ()) if frame.objects is None else (frame.objects.boxes, frame.objects.names)
+        labels = torch.tensor([self.classes.index(n) if n in self.classes else -1 for n in names]).long()
+        return Sample(frame.points.to(self.device), boxes, labels, note, frame.name)
+
+
+class EpochOrder(Sampler[list[tuple[int, int]]]):
+    """Batches of items (epoch, k), shuffled by seed and epoch: of each, from the batch `begin` on, a rank's share.
+
+    The last frames of an epoch that do not fill a batch are left out, unless there are no others.
+    """
+
+    def __init__(self, count: int, batch_size: int, seed: int) -> None:
+        self.count, self.batch_size, self.seed, self.epoch, self.begin = count, batch_size, seed, 0, 0
+
+    def __len__(self) -> int:
+        return max(1, self.count // self.batch_size)
+
+    def __iter__(self) -> Iterator[list[tuple[int, int]]]:
+        order = torch.randperm(self.count, generator=seeded(self.seed, self.epoch)).tolist()
+        for batch in range(self.begin, len(self)):
+            items = order[batch * self.batch_size : (batch + 1) * self.batch_size]
+            yield [(self.epoch, k) for k in items[ranks.rank() :: ranks.size()]]
+
+
+def seeded(*numbers: int) -> torch.Generator:
+    """A generator that depends on all of the numbers and on nothing else."""
+    seed = 0
+    for number in numbers:
+        seed = (seed * 6364136223846793005 + number + 1442695040888963407) % 2**63
+    return torch.Generator().manual_seed(seed)
+
+
+def collate(samples: Sequence[Sample | InputError]) -> Batch | InputError:
+    """Joins samples into a batch; if there is a mistake among them, it is the mistake."""
+    good = []
+    for each in samples:
+        if isinstance(each, InputError):
+            return each
+        good.append(each)
+    points, boxes, labels, notes, names = zip(*good, strict=True)
+    sample = torch.repeat_interleave(torch.arange(len(points)), torch.tensor([len(p) for p in points]))
+    return Batch(torch.cat(points), sample, list(boxes), list(labels), list(notes), list(names))
+
+
+def check_frames(frames: Frames, skip: bool, say: Callable[..., None]) -> tuple[list[int], Counter[str]]:
+    """The frames that can be read, and the names of the objects in them, so that a mistake is found before the run.
+
+    The first mistake raises InputError or, with `skip`, is named and its frame left out.
+    """
+    good, names = [], Counter[str]()
+    hidden = ranks.rank() > 0
+    for k in tqdm(range(len(frames)), desc="checking", unit="frame", leave=False, dynamic_ncols=True, disable=hidden):
+        try:
+            found = object_names(frames, k)
+            if found is None:
+                raise InputError(f"frame {frames.names[k]}: has no labels")
+            names.update(found)
+            good.append(k)
+        except (InputError, OSError) as error:
+            if not skip:
+                raise
+            say(f"frame {frames.names[k]} is skipped: {error}")
+    if not good:
+        raise InputError("no frame can be read")
+    return good, names

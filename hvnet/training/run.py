@@ -1,0 +1,407 @@
+"""A training run as one object, from top to bottom: its step, its epochs, its checkpoints.
+
+On a GPU the frames, the database and the augmentation live on the device. Several processes, started by torchrun, train
+one model together: each takes its share of every batch, and rank 0 prints and writes.
+"""
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch.utils.data import DataLoader
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from hvnet import ranks
+from hvnet.config import Config, TrainConfig, config_from_dict, config_to_dict
+from hvnet.data.augment import objects_of
+from hvnet.evaluation.scoring import Detected, background_note, print_once, score
+from hvnet.evaluation.tables import format_table
+from hvnet.exceptions import InputError, Stopped
+from hvnet.network.checkpoint import load_checkpoint, save_checkpoint
+from hvnet.network.detector import Detector
+from hvnet.network.model import HVNet
+from hvnet.pictures.clouds import Subject, draw_bev
+from hvnet.training.batches import Batch, Data, EpochOrder, TrainingFrames, check_frames, collate, training_objects
+
+SAVE_SECONDS = 300.0
+"""A run is saved after every epoch, and within one after so many seconds."""
+
+CHANGEABLE = [
+    f"train.{key}"
+    for key in ("epochs", "learning_rate", "validate_every", "pictures", "workers", "skip_corrupt", "skip_non_finite")
+]
+"""What may differ from the run that is resumed; the epochs only if the learning rate does not depend on them."""
+
+
+class Progress(NamedTuple):
+    """How far a run has come, and the sums of its losses in the epoch that is under way."""
+
+    epoch: int = 0  # epochs done, with their validation
+    batch: int = 0  # batches done of the next one
+    step: int = 0
+    sums: dict[str, float] | None = None
+
+
+class Run:
+    """A training run: model, optimizer, data, progress and the signals that have come."""
+
+    def __init__(
+        self, config: Config, data: Data, out: Path, device: torch.device | str = "cpu", *, resume: bool = False
+    ) -> None:
+        """Checks the data, and takes up the run in the folder `out` or begins one there.
+
+        Raises InputError for a mistake in the data or the checkpoint.
+        """
+        device = torch.device(device)
+        if device.type == "cuda":  # the frames lie on the device, and worker processes have none
+            config = replace(config, train=replace(config.train, workers=0))
+        self.config, self.data, self.out, self.device = config, data, Path(out), device
+        self.checkpoint = self.out / "checkpoint.pt"
+        self.signals: list[int] = []
+        self.seen: set[str] = set()  # notes that were printed
+        with deterministic():
+            torch.manual_seed(config.train.seed)
+            self.frames_id = hashlib.sha256(
+                json.dumps([list(data.train.names), list(data.val.names)]).encode()
+            ).hexdigest()
+            self.loader = self.make_loader()
+            self.model = HVNet(config).to(device)
+            self.joint = ranks.wrap_ddp(self.model)  # the model, with its gradients averaged over the ranks
+            self.optimizer = torch.optim.Adam(
+                self.model.parameters(), lr=config.train.learning_rate, weight_decay=config.train.weight_decay
+            )
+            self.progress = self.restore() if resume else Progress()
+        self.say(
+            f"{len(data.train)} frames to train, {len(data.val)} to validate, on {device}; the run is {out}", flush=True
+        )
+        if ranks.rank() == 0:
+            self.out.mkdir(parents=True, exist_ok=True)
+            if not resume:
+                self.save()  # a run that fails in its first epoch can go on
+            keep_metrics(self.out / "metrics.jsonl", self.progress.epoch)
+            if data.root is not None:
+                (self.out / "data.txt").write_text(f"{data.root.absolute()}\n", encoding="utf-8")
+
+    def say(self, text: str, **options: Any) -> None:
+        """Prints on the first rank."""
+        if ranks.rank() == 0:
+            print(text, **options)
+
+    def make_loader(self) -> DataLoader:
+        """The batches of the training frames, after a look at all frames."""
+        config, data = self.config, self.data
+        batch_size = config.train.batch_size
+        if batch_size % ranks.size():
+            raise InputError(f"train.batch_size: want a multiple of the {ranks.size()} ranks, got {batch_size}")
+        if ranks.size() > 1 and (config.loss.uncertainty or config.encoder.vfe == "pillar"):
+            raise InputError("loss.uncertainty and encoder.vfe=pillar: are for one process; start without torchrun")
+        # the order of a run that goes on must not depend on which frames can be read: the next one takes a place
+        order = EpochOrder(config.train.repeat * len(data.train), batch_size, config.train.seed)
+        if order.count < ranks.size():
+            raise InputError(f"{order.count} frames for {ranks.size()} ranks; start fewer")
+        good, names = check_frames(data.train, config.train.skip_corrupt, self.say)
+        names += check_frames(data.val, False, self.say)[1]
+        classes = [entry.name for entry in config.head.classes]
+        if note := background_note(names, classes):
+            self.say(note)
+        # worker processes know no GPU; without them the frames lie on it
+        place = self.device if config.train.workers == 0 else torch.device("cpu")
+        objects = None
+        if config.augment.objects or config.augment.whole_frames:
+            objects = objects_of(training_objects(data, good, self.say), place)
+        return DataLoader(
+            TrainingFrames(data.train, config, objects, place),
+            batch_sampler=order,
+            collate_fn=collate,
+            generator=torch.Generator(),  # or every epoch that is begun would draw from torch's own
+            num_workers=config.train.workers,
+            persistent_workers=config.train.workers > 0,
+            # a forked worker would inherit Warp, CUDA and the threads of this process
+            multiprocessing_context="spawn" if config.train.workers else None,
+            worker_init_fn=ignore_signals,
+        )
+
+    def step(self, batch: Batch) -> dict[str, float]:
+        """One step of the optimizer: the losses of the batch, summed over the ranks, and `stop`, if a signal has come.
+
+        A loss or gradient that is not finite changes nothing, and ends the run or is noted.
+        """
+        config, model, progress = self.config.train, self.model, self.progress
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(config, progress.step, progress.epoch, config.epochs * len(self.loader))
+        print_once(batch.notes, self.seen)
+        batch = batch.to(self.device)
+        statistics = {name: buffer.clone() for name, buffer in model.named_buffers() if config.skip_non_finite}
+        maps = self.joint(batch.points, batch.sample, len(batch.boxes))
+        terms = model.loss(maps, batch.boxes, batch.labels)
+        loss = torch.stack(list(terms.values())).sum()
+        self.optimizer.zero_grad(set_to_none=True)
+        (ranks.size() * loss).backward()  # the ranks' gradients are averaged, the loss is their sum
+        norm = torch.nn.utils.clip_grad_norm_(model.parameters(), config.gradient_clip)
+        parts = torch.stack([loss, *terms.values(), torch.full_like(loss, len(self.signals))]).detach()
+        losses = dict(zip(("loss", *terms, "stop"), ranks.all_reduce(parts).tolist(), strict=True))
+        if math.isfinite(losses["loss"] + norm.item()):
+            self.optimizer.step()
+            losses["batches"] = 1.0
+        else:
+            self.note_non_finite(losses["loss"], norm.item(), batch.names)
+            for name, buffer in model.named_buffers():  # the batch norms have seen what is not finite
+                buffer.copy_(statistics[name])
+        return losses
+
+    def epoch(self) -> dict[str, float]:
+        """The rest of the epoch that is under way: the means of its losses. The run is then saved, before a validation.
+
+        Raises Stopped, and has saved the run, if a signal comes.
+        """
+        epoch, batches, step, sums = self.progress
+        sums = dict(sums or {})
+        order = self.loader.batch_sampler
+        assert isinstance(order, EpochOrder)
+        order.epoch, order.begin = epoch, batches
+        saved = time.monotonic()
+        self.model.train()
+        bar = tqdm(
+            self.loader,
+            total=len(self.loader),
+            initial=batches,
+            desc=f"epoch {epoch + 1}/{self.config.train.epochs}",
+            unit="batch",
+            leave=False,
+            dynamic_ncols=True,
+            disable=ranks.rank() > 0,
+        )
+        with deterministic():
+            for batch in bar:
+                if isinstance(batch, InputError):
+                    raise batch
+                losses = self.step(batch)
+                stop = losses.pop("stop")
+                if "batches" in losses:
+                    for name, value in losses.items():
+                        sums[name] = sums.get(name, 0.0) + value
+                step, batches = step + 1, batches + 1
+                self.progress = Progress(epoch, batches, step, sums)
+                rate = self.config.train.batch_size * (bar.format_dict["rate"] or 0)
+                bar.set_postfix(loss=f"{losses['loss']:.3f}", frames=f"{rate:.1f}/s")
+                if stop:
+                    bar.close()
+                    self.save()
+                    self.stop()
+                if time.monotonic() - saved > SAVE_SECONDS:
+                    self.save()
+                    saved = time.monotonic()
+        self.save()
+        count = max(1.0, sums.pop("batches", 0.0))
+        return {name: total / count for name, total in sums.items()}
+
+    def validate(self) -> dict[str, dict[str, Any]]:
+        """Detects in the validation frames and scores the boxes as KITTI does; draws the first few."""
+        detector = Detector(self.model, self.device)
+        classes, point_range = detector.classes, self.config.encoder.point_range
+
+        def draw(detected: Detected) -> None:
+            if detected.k < self.config.train.pictures:
+                name = detected.frame.name
+                subject = Subject(detected.frame, detected.found, classes)
+                draw_bev(self.out / "pictures" / f"{name}.png", subject, point_range, f"frame {name}")
+
+        with deterministic():
+            return score(detector, self.data.val, visit=draw, seen=self.seen, title="validating")
+
+    def train(self) -> None:
+        """Runs the epochs that are left; writes checkpoint.pt, metrics.jsonl, tensorboard/ and pictures/.
+
+        SIGTERM or SIGINT ends it after the step that is under way, saved, by raising Stopped.
+        """
+        board = None
+        if ranks.rank() == 0:
+            board = SummaryWriter(str(self.out / "tensorboard"), purge_step=self.progress.epoch + 1)
+        options = self.config.train
+        with caught_signals(self.signals), contextlib.closing(board) if board else contextlib.nullcontext():
+            while self.progress.epoch < options.epochs:
+                number = self.progress.epoch + 1
+                losses = self.epoch()
+                parts = (f"{name} {value:.6f}" for name, value in losses.items())
+                self.say(f"epoch {number:3d}  " + "  ".join(parts), flush=True)
+                record: dict[str, Any] = {"epoch": number, "step": self.progress.step, **losses}
+                if number == options.epochs or number % options.validate_every == 0:
+                    scores = self.validate()
+                    self.say(format_table(scores), flush=True)
+                    record["validation"] = {
+                        name: {measure: table[measure] for measure in ("R40", "exact")}
+                        for name, table in scores.items()
+                    }
+                if board:
+                    self.write(record, board)
+                self.progress = Progress(number, 0, self.progress.step)
+                self.save()
+                stop = torch.full((), float(len(self.signals)), device=self.device)
+                if ranks.all_reduce(stop).item() > 0 and number < options.epochs:
+                    self.stop()
+        self.say(f"checkpoint: {self.checkpoint}\npictures:   {self.out / 'pictures'}")
+
+    def stop(self) -> None:
+        """Raises Stopped, on all ranks."""
+        ranks.broadcast(None)  # torchrun ends the others as soon as one has ended: not while the first still writes
+        message = (
+            f"stopped in epoch {self.progress.epoch + 1} after step {self.progress.step}; --resume goes on from there"
+        )
+        raise Stopped(message if ranks.rank() == 0 else "", self.signals[0] if self.signals else signal.SIGTERM)
+
+    def write(self, record: dict[str, Any], board: SummaryWriter) -> None:
+        """Adds an epoch to metrics.jsonl and to TensorBoard's files."""
+        for name, value in flatten(record):
+            board.add_scalar(name, value, record["epoch"])
+        board.flush()
+        with (self.out / "metrics.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(record) + "\n")
+
+    def note_non_finite(self, loss: float, norm: float, names: list[str]) -> None:
+        """Keeps the frames of a step whose loss or gradient is not finite in non_finite.jsonl; ends the run or not."""
+        names = [name for share in ranks.all_gather(names) for name in share]
+        path, epoch, step = self.out / "non_finite.jsonl", self.progress.epoch, self.progress.step
+        if ranks.rank() == 0:
+            with path.open("a", encoding="utf-8") as file:
+                line = {"epoch": epoch + 1, "step": step, "loss": str(loss), "gradient": str(norm), "frames": names}
+                file.write(json.dumps(line) + "\n")
+        what = f"the loss is {loss} and its gradient's norm {norm} at step {step}"
+        if not self.config.train.skip_non_finite:
+            remedy = "lower train.learning_rate, or set train.skip_non_finite, and --resume"
+            raise InputError(f"{what}; its frames are in {path}; {remedy}")
+        print_once([f"{what}: left out; its frames are in {path}"] if ranks.rank() == 0 else [], set())
+
+    def save(self) -> None:
+        """Writes a checkpoint: all that the run needs to go on."""
+        if ranks.rank() == 0:
+            content = {
+                "config": config_to_dict(self.config),
+                "model": self.model.state_dict(),
+                "optimizer": self.optimizer.state_dict(),
+                "frames": self.frames_id,
+                "random": torch.get_rng_state(),
+                **self.progress._asdict(),
+            }
+            save_checkpoint(self.checkpoint, content)
+
+    def restore(self) -> Progress:
+        """Takes up the run where its checkpoint left it. Raises InputError for a checkpoint of another run."""
+        path, content = self.checkpoint, load_checkpoint(self.checkpoint)
+        there = config_to_dict(config_from_dict(content["config"], str(path)))  # with the keys that are newer than it
+        here = config_to_dict(self.config)
+        changed = sorted({key for key, _ in set(_leaves(there)) ^ set(_leaves(here))})
+        fixed = {"train.epochs"} if self.config.train.cosine else set()
+        changed = [key for key in changed if key not in CHANGEABLE or key in fixed]
+        if changed:
+            raise InputError(f"{path}: was trained with another {changed[0]}; give its config, or another --out")
+        if content.get("frames") != self.frames_id:
+            raise InputError(f"{path}: was trained on other frames; give its --data, or another --out")
+        try:
+            self.model.load_state_dict(content["model"])
+            self.optimizer.load_state_dict(content["optimizer"])
+            torch.set_rng_state(content["random"])
+            return Progress(*(content[key] for key in Progress._fields))
+        except (KeyError, RuntimeError, ValueError, TypeError) as error:
+            raise InputError(f"{path}: does not hold a whole run ({error}); start anew with another --out") from error
+
+
+def learning_rate(config: TrainConfig, step: int, epoch: int, steps: int) -> float:
+    """Linear warm-up from warmup_ratio times the rate, then a decay at each of decay_epochs (Sec. 4.1) or a cosine.
+
+    `steps` is the length of the run.
+    """
+    if config.cosine:
+        done = (step - config.warmup_steps) / max(1, steps - config.warmup_steps)
+        decayed = config.learning_rate * (1 + math.cos(math.pi * min(max(done, 0.0), 1.0))) / 2
+    else:
+        decayed = config.learning_rate * config.decay_ratio ** sum(epoch >= end for end in config.decay_epochs)
+    if step < config.warmup_steps:
+        return decayed * (config.warmup_ratio + (1 - config.warmup_ratio) * step / config.warmup_steps)
+    return decayed
+
+
+@contextlib.contextmanager
+def deterministic() -> Iterator[None]:
+    """Inside, torch gives the same bits on every run; afterwards its flags are what they were."""
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read once, when CUDA starts
+    enabled, warn_only = (
+        torch.are_deterministic_algorithms_enabled(),
+        torch.is_deterministic_algorithms_warn_only_enabled(),
+    )
+    fill, benchmark = torch.utils.deterministic.fill_uninitialized_memory, torch.backends.cudnn.benchmark  # type: ignore[attr-defined]
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
+    torch.backends.cudnn.benchmark = False
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(enabled, warn_only=warn_only)
+        torch.utils.deterministic.fill_uninitialized_memory = fill  # type: ignore[attr-defined]
+        torch.backends.cudnn.benchmark = benchmark
+
+
+@contextlib.contextmanager
+def caught_signals(signals: list[int]) -> Iterator[None]:
+    """Inside, SIGTERM and SIGINT do not end the process: they are added to the list, and the loop looks there.
+
+    A second signal ends it at once: it raises Stopped wherever the program is.
+    """
+
+    def note(number: int, _: Any) -> None:
+        if signals:
+            raise Stopped("stopped at once; --resume goes on from the last checkpoint", number)
+        signals.append(number)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def ignore_signals(_: int) -> None:
+    """For worker processes: a signal to the whole group is this process's matter, and they end with it."""
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)
+
+
+def _leaves(tree: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """The values of a config with their dotted keys."""
+    if isinstance(tree, dict):
+        for name, value in tree.items():
+            yield from _leaves(value, f"{key}.{name}" if key else name)
+    else:
+        yield key, json.dumps(tree)
+
+
+def flatten(record: Any, key: str = "") -> Iterator[tuple[str, float]]:
+    """The numbers of a nested record with their paths, as TensorBoard names them."""
+    if isinstance(record, dict):
+        for name, value in record.items():
+            yield from flatten(value, f"{key}/{name}" if key else name)
+    elif isinstance(record, list):
+        for name, value in zip(("easy", "moderate", "hard"), record, strict=False):
+            yield from flatten(value, f"{key}/{name}")
+    elif record is not None:
+        yield key, float(record)
+
+
+def keep_metrics(path: Path, epochs: int) -> None:
+    """Leaves a line for each epoch that is done: a run may have stopped in or after a line, before its checkpoint."""
+    if path.is_file():
+        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+        if len(lines) > epochs:
+            partial = path.with_suffix(".partial")
+            partial.write_text("".join(lines[:epochs]), encoding="utf-8")
+            partial.replace(path)
