@@ -128,44 +128,24 @@ def _kernels(dtype: Any) -> SimpleNamespace:
         i = wp.tid()
         area[i] = overlap(a, i, b, i)
 
-    @wp.func
-    def same_group(group: wp.array(dtype=wp.int64), i: int, j: int):
-        """Whether boxes i and j may suppress each other; without groups (an empty array) all may."""
-        same = bool(True)
-        if group.shape[0] > 0:
-            same = group[i] == group[j]
-        return same
-
     @wp.kernel(enable_backward=False, module=module)
-    def nms_mask(
-        boxes: wp.array2d(dtype=dtype),
-        group: wp.array(dtype=wp.int64),
-        threshold: dtype,
-        mask: wp.array2d(dtype=wp.int64),
-    ):
+    def nms_mask(boxes: wp.array2d(dtype=dtype), threshold: dtype, mask: wp.array2d(dtype=wp.int64)):
         i, word = wp.tid()
         bits = wp.int64(0)
         for bit in range(WORD):
             j = word * WORD + bit
-            if j > i and j < boxes.shape[0]:
-                if same_group(group, i, j) and iou_bev(boxes, i, boxes, j) > threshold:
-                    bits = bits | (wp.int64(1) << wp.int64(bit))
+            if j > i and j < boxes.shape[0] and iou_bev(boxes, i, boxes, j) > threshold:
+                bits = bits | (wp.int64(1) << wp.int64(bit))
         mask[i, word] = bits
 
     @wp.kernel(enable_backward=False, module=module)
-    def nms_greedy(
-        boxes: wp.array2d(dtype=dtype),
-        group: wp.array(dtype=wp.int64),
-        threshold: dtype,
-        keep: wp.array(dtype=wp.bool),
-    ):
+    def nms_greedy(boxes: wp.array2d(dtype=dtype), threshold: dtype, keep: wp.array(dtype=wp.bool)):
         """One thread goes through the boxes from the best on; each that is kept drops those that it overlaps."""
         for i in range(boxes.shape[0]):
             if keep[i]:
                 for j in range(i + 1, boxes.shape[0]):
-                    if keep[j] and same_group(group, i, j):
-                        if iou_bev(boxes, i, boxes, j) > threshold:
-                            keep[j] = False
+                    if keep[j] and iou_bev(boxes, i, boxes, j) > threshold:
+                        keep[j] = False
 
     @wp.kernel(enable_backward=False, module=module)
     def match(
@@ -393,7 +373,9 @@ def _nms_order_outputs(boxes: Tensor, scores: Tensor, iou_threshold: float) -> t
 def _nms_order(boxes: Tensor, scores: Tensor, iou_threshold: float) -> tuple[Tensor, Tensor]:
     if boxes.device.type == "cpu":  # elsewhere it would be a read of the device
         _check_sizes("boxes", boxes)
-    return _greedy(boxes, scores, None, iou_threshold)
+    order, keep = _rank(boxes, scores, iou_threshold)
+    _suppress(boxes[order], iou_threshold, keep)
+    return order, keep
 
 
 _nms_order.register_fake(_nms_order_outputs)
@@ -402,7 +384,16 @@ _nms_order.register_fake(_nms_order_outputs)
 @torch.library.custom_op("hvnet::rotated_nms", mutates_args=())
 def _nms(boxes: Tensor, scores: Tensor, group: Tensor | None, iou_threshold: float) -> Tensor:
     _check_sizes("boxes", boxes)
-    order, keep = _greedy(boxes, scores, group, iou_threshold)
+    order, keep = _rank(boxes, scores, iou_threshold)
+    if group is None:
+        _suppress(boxes[order], iou_threshold, keep)
+    else:
+        group, by_group = torch.sort(group[order], stable=True)  # group after group, each with its best box first
+        sizes = torch.unique_consecutive(group, return_counts=True)[1].tolist()
+        keep_by_group = keep[by_group]
+        for rows, of_group in zip(boxes[order[by_group]].split(sizes), keep_by_group.split(sizes), strict=True):
+            _suppress(rows, iou_threshold, of_group)
+        keep[by_group] = keep_by_group
     return order[keep]
 
 
@@ -411,23 +402,26 @@ def _(boxes: Tensor, scores: Tensor, group: Tensor | None, iou_threshold: float)
     return boxes.new_empty(torch.library.get_ctx().new_dynamic_size(), dtype=torch.int64)
 
 
-def _greedy(boxes: Tensor, scores: Tensor, group: Tensor | None, iou_threshold: float) -> tuple[Tensor, Tensor]:
-    """What `nms_order` returns; boxes of different groups (M,) int64 do not drop each other."""
+def _rank(boxes: Tensor, scores: Tensor, iou_threshold: float) -> tuple[Tensor, Tensor]:
+    """The indices of the boxes, best score first, and which of these may be kept: all but those of a NaN score."""
     order, keep = _nms_order_outputs(boxes, scores, iou_threshold)
-    torch.sort(scores, descending=True, stable=True, out=(torch.empty_like(scores), order))
-    ranked = scores[order]
-    torch.eq(ranked, ranked, out=keep)  # a NaN score is never kept
+    ranked = torch.empty_like(scores)
+    torch.sort(scores, descending=True, stable=True, out=(ranked, order))
+    torch.eq(ranked, ranked, out=keep)
+    return order, keep
+
+
+def _suppress(boxes: Tensor, iou_threshold: float, keep: Tensor) -> None:
+    """Greedy NMS of boxes (M, 7), the best first: one that is kept clears keep (M,) bool of the worse it overlaps."""
     kernels, threshold = _kernels(WARP_FLOAT[boxes.dtype]), WARP_FLOAT[boxes.dtype](iou_threshold)
-    inputs = [array(boxes[order]), array(order.new_empty(0) if group is None else group[order]), threshold]
     if boxes.device.type == "cpu":  # one thread compares only boxes that are still there
-        launch(kernels.nms_greedy, 1, [*inputs, array(keep)], boxes.device)
+        launch(kernels.nms_greedy, 1, [array(boxes), threshold, array(keep)], boxes.device)
     else:  # many threads compare all pairs into a mask of bits, one thread sweeps it
         words = -(-len(boxes) // WORD)
         mask = torch.empty(len(boxes), words, dtype=torch.int64, device=boxes.device)
         removed = torch.zeros(words, dtype=torch.int64, device=boxes.device)
-        launch(kernels.nms_mask, (len(boxes), words), [*inputs, array(mask)], boxes.device)
+        launch(kernels.nms_mask, (len(boxes), words), [array(boxes), threshold, array(mask)], boxes.device)
         launch(_nms_sweep, 1, [array(mask), array(removed), array(keep)], boxes.device)
-    return order, keep
 
 
 def _match_outputs(anchors: Tensor, boxes: Tensor, starts: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -181,7 +181,8 @@ def nested_index(points: Tensor, sample: Tensor, grids: Sequence[Grid]) -> Neste
 @functools.cache
 def _nesting(grids: tuple[Grid, ...], device: torch.device) -> tuple[list[object], Tensor, int]:
     """What the kernels want of grids that nest: the finest grid, then of every scale (S, 3) the bits of a Morton key to
-    drop, N_L and N_W, and the bits of a key. Kept, so that a frame copies nothing to a GPU."""
+    drop, N_L and N_W, and the bits of a key. Cached so that no frame triggers a
+    host-to-device copy."""
     finest = min(grids, key=lambda grid: grid.cell)
     levels = [_level(grid, finest) or 0 for grid in grids]
     # inside every grid: the finest index, cut to a coarser grid's cells, is compared with each
