@@ -53,7 +53,7 @@ def raycast(
     check_tensor("directions", directions, (torch.float32,), (len(origins), 3), like=vertices)
     if not isinstance(max_range, int | float):
         raise TypeError(f"max_range: want a number of metres, got {type(max_range).__name__}")
-    if not max_range > 0 or math.isinf(max_range):
+    if not 0 < max_range < math.inf:
         raise ValueError(f"max_range: want a positive number of metres, got {max_range}")
     tensors = (tensor.detach() for tensor in (vertices, faces, origins, directions))
     return _raycast(*tensors, float(max_range))

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -618,7 +619,7 @@ def test_opcheck(dtype: torch.dtype, device: torch.device) -> None:
         torch.library.opcheck(op, arguments)
 
 
-def compiled_cases() -> dict[str, tuple[Callable[..., object], Callable[[int], tuple[Tensor, ...]]]]:
+def compiled_cases() -> dict[str, tuple[Callable[..., object], Callable[[int], tuple[Any, ...]]]]:
     """Every public function with arguments for a number of boxes."""
 
     def boxes(count: int) -> Tensor:
@@ -634,8 +635,8 @@ def compiled_cases() -> dict[str, tuple[Callable[..., object], Callable[[int], t
         "rotated_iou_bev": (rotated.rotated_iou_bev, lambda n: (boxes(n), boxes(n + 1))),
         "rotated_iou_3d": (rotated.rotated_iou_3d, lambda n: (boxes(n), boxes(n + 1))),
         "rotated_overlap_pairs": (rotated.rotated_overlap_pairs, lambda n: (boxes(n), boxes(n).flip(0))),
-        "rotated_nms": (lambda b, s: rotated.rotated_nms(b, s, 0.2), scored),
-        "nms_order": (lambda b, s: rotated.nms_order(b, s, 0.2), scored),
+        "rotated_nms": (rotated.rotated_nms, lambda n: (*scored(n), 1 / n)),
+        "nms_order": (rotated.nms_order, lambda n: (*scored(n), 1 / n)),
         "rotated_match": (rotated.rotated_match, lambda n: (boxes(n + 7), boxes(n), torch.tensor([0, 3, n]))),
         "box_iou_rotated": (rotated.box_iou_rotated, lambda n: (in_image(n)[0], in_image(n + 1)[0])),
         "nms_rotated": (lambda b, s, _: rotated.nms_rotated(b, s, 0.2), in_image),
