@@ -413,15 +413,27 @@ def _rank(boxes: Tensor, scores: Tensor, iou_threshold: float) -> tuple[Tensor, 
 
 def _suppress(boxes: Tensor, iou_threshold: float, keep: Tensor) -> None:
     """Greedy NMS of boxes (M, 7), the best first: one that is kept clears keep (M,) bool of the worse it overlaps."""
-    kernels, threshold = _kernels(WARP_FLOAT[boxes.dtype]), WARP_FLOAT[boxes.dtype](iou_threshold)
-    if boxes.device.type == "cpu":  # one thread compares only boxes that are still there
-        launch(kernels.nms_greedy, 1, [array(boxes), threshold, array(keep)], boxes.device)
-    else:  # many threads compare all pairs into a mask of bits, one thread sweeps it
-        words = -(-len(boxes) // WORD)
-        mask = torch.empty(len(boxes), words, dtype=torch.int64, device=boxes.device)
-        removed = torch.zeros(words, dtype=torch.int64, device=boxes.device)
-        launch(kernels.nms_mask, (len(boxes), words), [array(boxes), threshold, array(mask)], boxes.device)
-        launch(_nms_sweep, 1, [array(mask), array(removed), array(keep)], boxes.device)
+    if boxes.device.type == "cpu":
+        _suppress_serially(boxes, iou_threshold, keep)
+    else:
+        _suppress_in_parallel(boxes, iou_threshold, keep)
+
+
+def _suppress_serially(boxes: Tensor, iou_threshold: float, keep: Tensor) -> None:
+    """One thread compares only boxes that are still there."""
+    dtype = WARP_FLOAT[boxes.dtype]
+    launch(_kernels(dtype).nms_greedy, 1, [array(boxes), dtype(iou_threshold), array(keep)], boxes.device)
+
+
+def _suppress_in_parallel(boxes: Tensor, iou_threshold: float, keep: Tensor) -> None:
+    """Many threads compare all pairs into a mask of bits, one thread sweeps it."""
+    dtype = WARP_FLOAT[boxes.dtype]
+    words = -(-len(boxes) // WORD)
+    mask = torch.empty(len(boxes), words, dtype=torch.int64, device=boxes.device)
+    removed = torch.zeros(words, dtype=torch.int64, device=boxes.device)
+    inputs = [array(boxes), dtype(iou_threshold), array(mask)]
+    launch(_kernels(dtype).nms_mask, (len(boxes), words), inputs, boxes.device)
+    launch(_nms_sweep, 1, [array(mask), array(removed), array(keep)], boxes.device)
 
 
 def _match_outputs(anchors: Tensor, boxes: Tensor, starts: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -51,12 +51,12 @@ def scatter_max(src: Tensor, index: Tensor, dim_size: int) -> tuple[Tensor, Tens
     The gradient goes to the arg-max point alone, and is differentiable itself (a gather). Raises TypeError or
     ValueError naming the argument.
     """
-    return segment_max(src, _checked_segments(src, index, dim_size))
+    return segment_max(src, _segments_of(src, index, dim_size))
 
 
 def scatter_mean(src: Tensor, index: Tensor, dim_size: int) -> Tensor:
     """Mean of the rows of src (N, C) that share an index (N,): (dim_size, C); an empty row is 0 (Eq. 2's means)."""
-    return segment_mean(src, _checked_segments(src, index, dim_size))
+    return segment_mean(src, _segments_of(src, index, dim_size))
 
 
 def gather(src: Tensor, index: Tensor) -> Tensor:
@@ -68,27 +68,32 @@ def gather(src: Tensor, index: Tensor) -> Tensor:
 
 def segment_max(src: Tensor, voxels: Segments) -> tuple[Tensor, Tensor]:
     """`scatter_max` over segments that are at hand: src (N, C) gives values and arg-max (V, C)."""
+    check_tensor("src", src, FLOATS, (voxels.voxel.shape[0], None), like=voxels.voxel)
     values, argmax = _segment_max(src, voxels.voxel, voxels.order, voxels.starts)
     return values, argmax.long()
 
 
 def segment_mean(src: Tensor, voxels: Segments) -> Tensor:
     """`scatter_mean` over segments that are at hand: src (N, C) gives (V, C)."""
+    check_tensor("src", src, FLOATS, (voxels.voxel.shape[0], None), like=voxels.voxel)
     count = voxels.starts.diff().clamp(min=1).unsqueeze(1)
     return _segment_sum(src, voxels.voxel, voxels.order, voxels.starts) / count
 
 
 def segment_gather(src: Tensor, voxels: Segments) -> Tensor:
     """`gather` over segments that are at hand: src (V, C) gives (N, C)."""
+    check_tensor("src", src, FLOATS, (voxels.starts.shape[0] - 1, None), like=voxels.voxel)
     return _gather(src, voxels.voxel, voxels.order, voxels.starts)
 
 
 def segment_add(base: Tensor, src: Tensor, voxels: Segments) -> Tensor:
     """base (N, C) plus the rows of src (V, C) that belong to its points, in one pass: base + segment_gather(src)."""
+    check_tensor("base", base, FLOATS, (voxels.voxel.shape[0], None), like=voxels.voxel)
+    check_tensor("src", src, (base.dtype,), (voxels.starts.shape[0] - 1, base.shape[1]), like=base)
     return _gather_add(base, src, voxels.voxel, voxels.order, voxels.starts)
 
 
-def _checked_segments(src: Tensor, index: Tensor, dim_size: int) -> Segments:
+def _segments_of(src: Tensor, index: Tensor, dim_size: int) -> Segments:
     check_tensor("src", src, FLOATS, (None, None))
     check_tensor("index", index, (torch.int64,), (src.shape[0],), like=src)
     return segments(index, dim_size)

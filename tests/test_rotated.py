@@ -249,6 +249,19 @@ def test_nms_equals_twin(count: int, threshold: float, dtype: torch.dtype, devic
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("count", [0, 1, 64, 65, 300])
+def test_nms_of_one_thread_and_of_many(count: int, dtype: torch.dtype, device: torch.device) -> None:
+    """The CPU goes through the boxes in one thread, a GPU masks them in many: here both ways on one device."""
+    boxes = random_boxes(count, 26, spread=8).to(device, dtype)
+    keep = torch.rand(count, generator=torch.Generator().manual_seed(0)).to(device) > 0.2  # some have a NaN score
+    serial, parallel = keep.clone(), keep.clone()
+    rotated._suppress_serially(boxes, 0.1, serial)
+    rotated._suppress_in_parallel(boxes, 0.1, parallel)
+    assert torch.equal(serial, parallel)
+    assert not (serial & ~keep).any()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
 def test_nms_by_hand(dtype: torch.dtype, device: torch.device) -> None:
     def kept(boxes: list[Tensor], scores: list[float], threshold: float) -> list[int]:
         given = torch.cat(boxes).to(device, dtype), torch.tensor(scores, dtype=dtype, device=device)

@@ -478,6 +478,22 @@ def test_bad_size(function: Callable[[Tensor, Tensor, int], object]) -> None:
         function(torch.ones(3, 2), torch.zeros(3, dtype=torch.int64), 0)
 
 
+def test_bad_rows_of_segments_at_hand() -> None:
+    """An index of these segments beyond src would be a read of foreign memory."""
+    voxels = scatter.segments(torch.tensor([0, 1, 1]), 2)
+    for function, rows in ((scatter.segment_max, 3), (scatter.segment_mean, 3), (scatter.segment_gather, 2)):
+        with pytest.raises(ValueError, match=rf"src.*\({rows}, any\).*\(1, 4\)"):
+            function(torch.ones(1, 4), voxels)
+        with pytest.raises(TypeError, match=r"src.*int64"):
+            function(torch.ones(rows, 4, dtype=torch.int64), voxels)
+    with pytest.raises(ValueError, match=r"base.*\(3, any\)"):
+        scatter.segment_add(torch.ones(2, 4), torch.ones(2, 4), voxels)
+    with pytest.raises(ValueError, match=r"src.*\(2, 4\)"):
+        scatter.segment_add(torch.ones(3, 4), torch.ones(3, 4), voxels)
+    with pytest.raises(TypeError, match=r"src.*float64"):
+        scatter.segment_add(torch.ones(3, 4), torch.ones(2, 4).double(), voxels)
+
+
 def test_bad_segments() -> None:
     with pytest.raises(TypeError, match=r"index.*int32"):
         scatter.segments(torch.zeros(3, dtype=torch.int32), 2)
