@@ -58,6 +58,19 @@ def test_gradcheck(relu: bool, keep: bool, device: torch.device) -> None:
     assert torch.autograd.gradcheck(outputs, (features.requires_grad_(), layer.requires_grad_()))
 
 
+def test_second_derivatives(device: torch.device) -> None:
+    """Of sums and images; the product of `attend` has none, and says so."""
+    rows = torch.randn(4, 3, dtype=torch.float64, device=device, requires_grad=True)
+    cursor = torch.tensor([5, 0, 3, 8], device=device)
+    assert torch.autograd.gradgradcheck(lambda x: [sums.sin() for sums in column_sums(x)], rows)
+    assert torch.autograd.gradgradcheck(lambda x: write_image(x, cursor, 9).sin(), rows)
+    features, points, mean, layer, at = case(12, 5, 3, torch.float64, device, ordered=False)
+    values = attend(features.requires_grad_(), points, mean, layer, at)[1]
+    (grad,) = torch.autograd.grad(values.square().sum(), features, create_graph=True)
+    with pytest.raises(RuntimeError, match="attend_backward"):
+        grad.sum().backward()
+
+
 def test_float32_is_near_float64(device: torch.device) -> None:
     features, points, mean, layer, at = case(500, 90, 64, torch.float64, device, ordered=True)
     want = attend(features, points, mean, layer, at)

@@ -1,7 +1,9 @@
 """Rotated IoU, NMS and matching against shapely in float64, hand-made cases and their twins."""
 
 import math
+import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -576,6 +578,17 @@ def test_batched_nms_by_hand(device: torch.device) -> None:
         assert (empty.shape, empty.dtype) == ((0,), torch.int64)
         assert module.nms_rotated(none, none[:, 0], 0.5).shape == (0,)
         assert module.box_iou_rotated(none, boxes).shape == (0, 5)
+
+
+def test_example_of_the_docs() -> None:
+    text = (Path(__file__).resolve().parents[1] / "docs" / "kernels.md").read_text(encoding="utf-8")
+    (example,) = (
+        each for each in re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL) if "nms" in each
+    )
+    scope: dict[str, Tensor] = {}
+    exec(compile(example, "docs/kernels.md", "exec"), scope)
+    assert scope["kept"].tolist() == [0, 2]
+    equals(scope["iou"], image_iou(scope["boxes"], scope["boxes"]), 1e-5)
 
 
 def test_bad_image_boxes() -> None:
