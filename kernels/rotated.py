@@ -313,11 +313,12 @@ def _check_scored(boxes: Tensor, scores: Tensor, iou_threshold: float, columns: 
 
 
 def _check_sizes(name: str, boxes: Tensor, count: int = 3) -> None:
-    """Checks that length, width and (count 3) height are not negative; reads the device once. NaN is let through."""
-    negative = boxes[:, 3 : 3 + count] < 0
-    if negative.any():
-        size = boxes[:, 3 : 3 + count][negative][0].item()
-        raise ValueError(f"{name}: want sizes of 0 or more, got {size:g}")
+    """Checks that length, width and (count 3) height are not negative; NaN is let through. Reads the device."""
+    sizes = boxes[:, 3 : 3 + count]
+    if sizes.numel() and not sizes.min() >= 0:  # below 0, or NaN, which hides the others
+        smallest = sizes.nan_to_num(nan=0.0).min().item()
+        if smallest < 0:
+            raise ValueError(f"{name}: want sizes of 0 or more, got {smallest:g}")
 
 
 def _iou_outputs(a: Tensor, b: Tensor) -> Tensor:
