@@ -153,7 +153,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
     """The kernels for one floating type and vector length, in a module of their own."""
     vec = wp.types.vector(length=lanes, dtype=dtype)
     point = wp.types.vector(length=4, dtype=dtype)
-    places = wp.types.vector(length=lanes, dtype=wp.int32)
+    int_vec = wp.types.vector(length=lanes, dtype=wp.int32)
     wide = wp.types.vector(length=lanes, dtype=wp.float64)
     module = wp.Module(f"hvnet_encode_{dtype.__name__}_{lanes}", None)
     zero = dtype(0.0)
@@ -196,7 +196,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         relu: int,
         product: wp.array2d(dtype=vec),
         values: wp.array2d(dtype=vec),
-        argmax: wp.array2d(dtype=places),
+        argmax: wp.array2d(dtype=int_vec),
     ):
         voxel, c = wp.tid()
         centre = mean[voxel]
@@ -204,7 +204,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         w0, w1, w2, w3 = weight[0, c], weight[1, c], weight[2, c], weight[3, c]
         scale, shift = weight[9, c], weight[10, c]
         best = vec()
-        at = places(-1)
+        at = int_vec(-1)
         start = int(starts[voxel])
         for k in range(start, int(starts[voxel + 1])):
             i = point_at(order, k)
@@ -214,7 +214,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
                 product[i, c] = row
             if k == start:
                 best = row
-                at = places(i)
+                at = int_vec(i)
             for lane in range(lanes):
                 if row[lane] >= best[lane]:
                     best[lane] = row[lane]
@@ -232,7 +232,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         weight: wp.array2d(dtype=vec),
         order: wp.array(dtype=wp.int64),
         starts: wp.array(dtype=wp.int64),
-        argmax: wp.array2d(dtype=places),
+        argmax: wp.array2d(dtype=int_vec),
         relu: int,
         grad_features: wp.array2d(dtype=vec),
         grad_weight: wp.array3d(dtype=vec),
@@ -451,6 +451,22 @@ def _clear_kernel(lanes: int, image_dtype: Any) -> wp.Kernel:
     return clear
 
 
+def _attend_outputs(
+    features: Tensor,
+    points: Tensor,
+    mean: Tensor,
+    layer: Tensor,
+    order: Tensor | None,
+    starts: Tensor,
+    relu: bool,
+    keep: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    count = features.shape[1]
+    product = features.new_empty(features.shape[0] if keep else 0, count)
+    values = features.new_empty(mean.shape[0], count)
+    return product, values, features.new_empty(mean.shape[0], count, dtype=torch.int32)
+
+
 @torch.library.custom_op("hvnet::attend", mutates_args=())
 def _attend(
     features: Tensor,
@@ -463,9 +479,7 @@ def _attend(
     keep: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     count, lanes = features.shape[1], lanes_of(features.shape[1])
-    product = features.new_empty(features.shape[0] if keep else 0, count)
-    values = features.new_empty(mean.shape[0], count)
-    argmax = torch.empty(mean.shape[0], count, dtype=torch.int32, device=features.device)
+    outputs = _attend_outputs(features, points, mean, layer, order, starts, relu, keep)
     inputs = [
         channels(features.contiguous(), lanes),
         array(points.contiguous(), 4),
@@ -474,27 +488,29 @@ def _attend(
         array(starts.new_empty(0) if order is None else order.contiguous()),
         array(starts.contiguous()),
         int(relu),
-        *(channels(output, lanes) for output in (product, values, argmax)),
+        *(channels(output, lanes) for output in outputs),
     ]
     kernel = _kernels(WARP_FLOAT[features.dtype], lanes).forward
     launch(kernel, (mean.shape[0], count // lanes), inputs, features.device)
-    return product, values, argmax
+    return outputs
 
 
-@_attend.register_fake
-def _(
+_attend.register_fake(_attend_outputs)
+
+
+def _attend_backward_outputs(
+    grad_product: Tensor | None,
+    grad_values: Tensor,
     features: Tensor,
     points: Tensor,
     mean: Tensor,
     layer: Tensor,
     order: Tensor | None,
     starts: Tensor,
+    argmax: Tensor,
     relu: bool,
-    keep: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
-    values = features.new_empty(mean.shape[0], features.shape[1])
-    product = features.new_empty(features.shape[0] if keep else 0, features.shape[1])
-    return product, values, torch.empty_like(values, dtype=torch.int32)
+) -> tuple[Tensor, Tensor]:
+    return features.new_empty(features.shape), layer.new_empty(layer.shape)
 
 
 @torch.library.custom_op("hvnet::attend_backward", mutates_args=())
@@ -512,8 +528,10 @@ def _attend_backward(
 ) -> tuple[Tensor, Tensor]:
     count, lanes = features.shape[1], lanes_of(features.shape[1])
     blocks = -(-mean.shape[0] // VOXELS)
-    grad_features = features.new_empty(features.shape)
-    grad_layer = features.new_empty(blocks, LAYER, count)
+    grad_features, grad_layer = _attend_backward_outputs(
+        grad_product, grad_values, features, points, mean, layer, order, starts, argmax, relu
+    )
+    of_blocks = features.new_empty(blocks, LAYER, count)
     given = features.new_empty(0, count) if grad_product is None else grad_product.contiguous()
     inputs = [
         channels(given, lanes),
@@ -524,29 +542,17 @@ def _attend_backward(
         channels(layer.contiguous(), lanes),
         array(starts.new_empty(0) if order is None else order.contiguous()),
         array(starts.contiguous()),
-        channels(argmax, lanes),
+        channels(argmax.contiguous(), lanes),
         int(relu),
         channels(grad_features, lanes),
-        array(grad_layer.view(blocks, LAYER, count // lanes, lanes), lanes),
+        array(of_blocks.view(blocks, LAYER, count // lanes, lanes), lanes),
     ]
     launch(_kernels(WARP_FLOAT[features.dtype], lanes).backward, (blocks, count // lanes), inputs, features.device)
-    return grad_features, grad_layer.sum(dim=0)
+    torch.sum(of_blocks, dim=0, out=grad_layer)
+    return grad_features, grad_layer
 
 
-@_attend_backward.register_fake
-def _(
-    grad_product: Tensor | None,
-    grad_values: Tensor,
-    features: Tensor,
-    points: Tensor,
-    mean: Tensor,
-    layer: Tensor,
-    order: Tensor | None,
-    starts: Tensor,
-    argmax: Tensor,
-    relu: bool,
-) -> tuple[Tensor, Tensor]:
-    return features.new_empty(features.shape), torch.empty_like(layer)
+_attend_backward.register_fake(_attend_backward_outputs)
 
 
 def _save(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:
@@ -570,20 +576,25 @@ def _backward(ctx: Any, grad_product: Tensor | None, grad_values: Tensor | None,
 _attend.register_autograd(_backward, setup_context=_save)
 
 
+def _column_sums_outputs(rows: Tensor) -> tuple[Tensor, Tensor]:
+    count = rows.shape[1]
+    return rows.new_empty(count, dtype=torch.float64), rows.new_empty(count, dtype=torch.float64)
+
+
 @torch.library.custom_op("hvnet::column_sums", mutates_args=())
 def _column_sums(rows: Tensor) -> tuple[Tensor, Tensor]:
     count, lanes = rows.shape[1], lanes_of(rows.shape[1])
     blocks = -(-rows.shape[0] // ROWS)
-    total, squares = (torch.empty(blocks, count, dtype=torch.float64, device=rows.device) for _ in range(2))
-    inputs = [channels(rows.contiguous(), lanes), channels(total, lanes), channels(squares, lanes)]
+    outputs = _column_sums_outputs(rows)
+    of_blocks = [rows.new_empty(blocks, count, dtype=torch.float64) for _ in outputs]
+    inputs = [channels(rows.contiguous(), lanes), *(channels(sums, lanes) for sums in of_blocks)]
     launch(_kernels(WARP_FLOAT[rows.dtype], lanes).sums, (blocks, count // lanes), inputs, rows.device)
-    return total.sum(dim=0), squares.sum(dim=0)
+    for sums, output in zip(of_blocks, outputs, strict=True):
+        torch.sum(sums, dim=0, out=output)
+    return outputs
 
 
-@_column_sums.register_fake
-def _(rows: Tensor) -> tuple[Tensor, Tensor]:
-    total = rows.new_empty(rows.shape[1], dtype=torch.float64)
-    return total, torch.empty_like(total)
+_column_sums.register_fake(_column_sums_outputs)
 
 
 def _save_rows(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:

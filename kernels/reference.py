@@ -1,6 +1,6 @@
 """Twins of the kernels in plain torch and numpy, for tests and benchmarks only.
 
-The names and signatures are those of the kernels; what a twin must be is obvious, not fast.
+The names and signatures are those of the kernels. Twins aim to be obvious, not fast.
 """
 
 from __future__ import annotations
@@ -205,14 +205,45 @@ def rotated_iou_3d(a: Tensor, b: Tensor) -> Tensor:
 def rotated_nms(boxes: Tensor, scores: Tensor, iou_threshold: float) -> Tensor:
     """Indices (K,) of the boxes (M, 7) kept, best of the scores (M,) first; of equal scores the lower index is better.
 
-    A box is dropped iff its IoU in bird's eye view with a better box that is kept exceeds the threshold.
+    A box is dropped iff its IoU in bird's eye view with a better box that is kept exceeds the threshold, or if its
+    score is NaN.
     """
-    rows = boxes.tolist()
+    rows, is_number = boxes.tolist(), scores == scores
     kept: list[int] = []
     for k in scores.argsort(descending=True, stable=True).tolist():
-        if all(_iou_bev(rows[k], rows[better]) <= iou_threshold for better in kept):
+        if is_number[k] and all(_iou_bev(rows[k], rows[better]) <= iou_threshold for better in kept):
             kept.append(k)
     return torch.tensor(kept, dtype=torch.int64, device=boxes.device)
+
+
+def _box_of(row: Sequence[float], degrees: bool) -> Box:
+    """The box of (cx, cy, w, h, angle), with the y axis of an image, which points down, turned up."""
+    cx, cy, w, h, angle = row
+    return [cx, -cy, 0.0, w, h, 0.0, math.radians(angle) if degrees else angle]
+
+
+def box_iou_rotated(a: Tensor, b: Tensor, *, degrees: bool = True) -> Tensor:
+    """IoU (A, B) of boxes a (A, 5) and b (B, 5), (cx, cy, w, h, angle) as torchvision and detectron2 have them."""
+    first, second = ([_box_of(row, degrees) for row in boxes.tolist()] for boxes in (a, b))
+    return a.new_tensor([[_iou_bev(p, q) for q in second] for p in first]).reshape(len(a), len(b))
+
+
+def nms_rotated(boxes: Tensor, scores: Tensor, iou_threshold: float, *, degrees: bool = True) -> Tensor:
+    """`rotated_nms` of boxes (M, 5) as `box_iou_rotated` has them."""
+    turned = torch.tensor([_box_of(row, degrees) for row in boxes.tolist()], dtype=torch.float64).reshape(-1, 7)
+    return rotated_nms(turned, scores.cpu(), iou_threshold).to(boxes.device)
+
+
+def batched_nms_rotated(
+    boxes: Tensor, scores: Tensor, idxs: Tensor, iou_threshold: float, *, degrees: bool = True
+) -> Tensor:
+    """One `nms_rotated` for each of the groups that idxs (M,) names; the indices kept of all, best score first."""
+    kept = []
+    for group in idxs.unique():
+        members = (idxs == group).nonzero()[:, 0]
+        kept.append(members[nms_rotated(boxes[members], scores[members], iou_threshold, degrees=degrees)])
+    merged = torch.cat(kept).sort().values if kept else torch.zeros_like(idxs, dtype=torch.int64)
+    return merged[scores[merged].argsort(descending=True, stable=True)]
 
 
 def rotated_match(anchors: Tensor, boxes: Tensor, starts: Tensor) -> tuple[Tensor, Tensor, Tensor]:

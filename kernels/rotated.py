@@ -1,11 +1,15 @@
 """Rotated boxes (x, y, z, l, w, h, yaw): overlap and IoU in BEV and 3D, NMS, and matching of anchors to boxes.
 
+The same for boxes (cx, cy, w, h, angle) as torchvision and detectron2 have them. Nothing here has gradients.
+
 The intersection of two rectangles is exact: in the frame of rectangle a, Green's theorem turns its area into the
 integral of clamp(x, -l/2, l/2) dy along the edges of b where |y| <= w/2. That has no list of vertices and no special
 case, and it is continuous, so that touching, identical and nearly parallel edges are as exact as any other.
 """
 
 import functools
+from itertools import pairwise
+from numbers import Real
 from types import SimpleNamespace
 from typing import Any
 
@@ -154,18 +158,18 @@ def _kernels(dtype: Any) -> SimpleNamespace:
     ):
         sample, i = wp.tid()
         highest = zero
-        at = int(-1)
+        of_highest = int(-1)
         for j in range(int(starts[sample]), int(starts[sample + 1])):
             value = iou_bev(anchors, i, boxes, j)
             if value > highest:
                 highest = value
-                at = j
+                of_highest = j
             if value > zero:
                 # the order of the maximum does not matter: bits of the IoU above, then the lowest anchor
                 key = wp.int64(wp.cast(wp.float32(value), wp.int32)) << wp.int64(32)
                 wp.atomic_max(best, j, key | wp.int64(0x7FFFFFFF - i))
         iou[sample, i] = highest
-        box[sample, i] = wp.int64(at)
+        box[sample, i] = wp.int64(of_highest)
 
     return SimpleNamespace(
         matrix_bev=matrix_bev, matrix_3d=matrix_3d, pairs=pairs, nms_mask=nms_mask, nms_greedy=nms_greedy, match=match
@@ -174,10 +178,10 @@ def _kernels(dtype: Any) -> SimpleNamespace:
 
 @wp.kernel(enable_backward=False, module="unique")
 def _nms_sweep(mask: wp.array2d(dtype=wp.int64), removed: wp.array(dtype=wp.int64), keep: wp.array(dtype=wp.bool)):
-    """Goes through the boxes from the best on; each that is kept removes those that its mask names."""
+    """Goes through the boxes that may be kept, best first; each that is kept removes those that its mask names."""
     for i in range(mask.shape[0]):
         word = i // WORD
-        kept = ((removed[word] >> wp.int64(i - word * WORD)) & wp.int64(1)) == wp.int64(0)
+        kept = keep[i] and ((removed[word] >> wp.int64(i - word * WORD)) & wp.int64(1)) == wp.int64(0)
         keep[i] = kept
         if kept:
             for k in range(word, mask.shape[1]):
@@ -185,55 +189,52 @@ def _nms_sweep(mask: wp.array2d(dtype=wp.int64), removed: wp.array(dtype=wp.int6
 
 
 def rotated_iou_bev(a: Tensor, b: Tensor) -> Tensor:
-    """IoU in bird's eye view of boxes a (A, 7) and b (B, 7), float32 or float64: (A, B) in [0, 1]."""
+    """IoU in bird's eye view of boxes a (A, 7) and b (B, 7), float32 or float64: (A, B) in [0, 1].
+
+    Raises TypeError or ValueError naming the argument, also for a negative size.
+    """
     _check_pair(a, b)
-    return _matrix("matrix_bev", a, b)
+    return _iou_bev(a.detach(), b.detach())
 
 
 def rotated_iou_3d(a: Tensor, b: Tensor) -> Tensor:
-    """IoU in 3D of boxes a (A, 7) and b (B, 7), float32 or float64: (A, B) in [0, 1]."""
+    """IoU in 3D of boxes a (A, 7) and b (B, 7), float32 or float64: (A, B) in [0, 1].
+
+    Raises TypeError or ValueError naming the argument, also for a negative size.
+    """
     _check_pair(a, b)
-    return _matrix("matrix_3d", a, b)
+    return _iou_3d(a.detach(), b.detach())
 
 
 def rotated_overlap_pairs(a: Tensor, b: Tensor) -> Tensor:
-    """Area in bird's eye view that box a[i] shares with box b[i], both (P, 7): (P,) square metres."""
+    """Area in bird's eye view that box a[i] shares with box b[i], both (P, 7): (P,) square metres.
+
+    Raises TypeError or ValueError naming the argument, also for a negative length or width; heights are not read.
+    """
     _check_pair(a, b)
-    check_tensor("b", b, FLOATS, (len(a), 7))
-    area = a.new_empty(len(a))
-    kernels = _kernels(WARP_FLOAT[a.dtype])
-    launch(kernels.pairs, len(a), [array(a.contiguous()), array(b.contiguous()), array(area)], a.device)
-    return area
+    check_tensor("b", b, FLOATS, (a.shape[0], 7))
+    return _overlap_pairs(a.detach(), b.detach())
 
 
 def rotated_nms(boxes: Tensor, scores: Tensor, iou_threshold: float) -> Tensor:
-    """Greedy NMS: indices (K,) of the boxes (M, 7) kept, best score first; equal scores keep the lower index first.
+    """Greedy NMS: indices (K,) int64 of the boxes (M, 7) kept, best score first; equal scores keep the lower index
+    first, and a NaN score is never kept.
 
-    A box is dropped iff its BEV IoU with a kept better box is above the threshold (Sec. 4.1 of the paper).
+    A box is dropped iff its BEV IoU with a kept better box is above the threshold (Sec. 4.1 of the paper). Raises
+    TypeError or ValueError naming the argument, also for a negative size.
     """
-    order, keep = nms_order(boxes, scores, iou_threshold)
-    return order[keep]
+    _check_scored(boxes, scores, iou_threshold, 7)
+    return _nms(boxes.detach(), scores.detach(), None, float(iou_threshold))
 
 
 def nms_order(boxes: Tensor, scores: Tensor, iou_threshold: float) -> tuple[Tensor, Tensor]:
-    """`rotated_nms` in arrays of fixed size: the indices (M,) of all boxes, best score first, and which of these are
-    kept (M,) bool. Nothing is read from the device."""
-    check_tensor("boxes", boxes, FLOATS, (None, 7))
-    check_tensor("scores", scores, FLOATS, (len(boxes),), like=boxes)
-    order = torch.sort(scores, descending=True, stable=True).indices
-    keep = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
-    dtype = WARP_FLOAT[boxes.dtype]
-    ranked = array(boxes[order].contiguous())
-    if boxes.device.type == "cpu":  # one thread compares only boxes that are still there
-        launch(_kernels(dtype).nms_greedy, 1, [ranked, dtype(iou_threshold), array(keep)], boxes.device)
-    else:  # many threads compare all pairs into a mask of bits, one thread sweeps it
-        words = -(-len(boxes) // WORD)
-        mask = torch.empty(len(boxes), words, dtype=torch.int64, device=boxes.device)
-        removed = torch.zeros(words, dtype=torch.int64, device=boxes.device)
-        inputs = [ranked, dtype(iou_threshold), array(mask)]
-        launch(_kernels(dtype).nms_mask, (len(boxes), words), inputs, boxes.device)
-        launch(_nms_sweep, 1, [array(mask), array(removed), array(keep)], boxes.device)
-    return order, keep
+    """`rotated_nms` in arrays of fixed size: the indices (M,) int64 of all boxes, best score first (NaN before all),
+    and which of these are kept (M,) bool.
+
+    Nothing is read from the device, so that on CUDA a negative size is not seen; on the CPU it is a ValueError.
+    """
+    _check_scored(boxes, scores, iou_threshold, 7)
+    return _nms_order(boxes.detach(), scores.detach(), float(iou_threshold))
 
 
 def rotated_match(anchors: Tensor, boxes: Tensor, starts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -241,30 +242,220 @@ def rotated_match(anchors: Tensor, boxes: Tensor, starts: Tensor) -> tuple[Tenso
 
     Returns the best IoU of every anchor (B, A), the box that gives it (B, A) int64 (ties: the lowest box; -1: no
     overlap), and the anchor that overlaps each box most (M,) int64 (ties, to the bit of float32: the lowest anchor;
-    -1: no overlap). No matrix of anchors times boxes is made.
+    -1: no overlap). No matrix of anchors times boxes is made. Raises TypeError or ValueError naming the argument, also
+    for a negative size.
     """
     _check_pair(anchors, boxes, "anchors", "boxes")
     check_tensor("starts", starts, (torch.int64,), (None,), like=boxes)
-    if len(anchors) >= 2**31:
-        raise ValueError(f"anchors: want fewer than 2^31, got {len(anchors)}")
-    if len(starts) == 0 or starts[0] != 0 or starts[-1] != len(boxes) or (starts.diff() < 0).any():
-        raise ValueError(f"starts: want ascending values from 0 to {len(boxes)}, got {starts.tolist()}")
-    batch = len(starts) - 1
-    iou = anchors.new_empty(batch, len(anchors))
-    match = torch.empty(batch, len(anchors), dtype=torch.int64, device=anchors.device)
-    best = torch.full((len(boxes),), -1, dtype=torch.int64, device=anchors.device)
-    inputs = [array(t.contiguous()) for t in (anchors, boxes, starts)] + [array(iou), array(match), array(best)]
-    launch(_kernels(WARP_FLOAT[anchors.dtype]).match, (batch, len(anchors)), inputs, anchors.device)
-    return iou, match, torch.where(best < 0, best, 0x7FFFFFFF - (best & 0x7FFFFFFF))
+    if anchors.shape[0] >= 2**31:
+        raise ValueError(f"anchors: want fewer than 2^31, got {anchors.shape[0]}")
+    if starts.shape[0] == 0:
+        raise ValueError(f"starts: want ascending values from 0 to {boxes.shape[0]}, got []")
+    return _match(anchors.detach(), boxes.detach(), starts)
 
 
-def _matrix(name: str, a: Tensor, b: Tensor) -> Tensor:
-    iou = a.new_empty(len(a), len(b))
+def box_iou_rotated(a: Tensor, b: Tensor, *, degrees: bool = True) -> Tensor:
+    """IoU of boxes a (A, 5) and b (B, 5), float32 or float64: (A, B) in [0, 1].
+
+    A box is (cx, cy, w, h, angle) as in torchvision and detectron2: in an image, whose y points down, w lies along x
+    and h along y before the box is turned by the angle, counter-clockwise as it is seen; in degrees, or in radians
+    with degrees=False. Raises TypeError or ValueError naming the argument, also for a negative size.
+    """
+    _check_pair(a, b, columns=5)
+    return _iou_bev(_upright(a.detach(), degrees), _upright(b.detach(), degrees))
+
+
+def nms_rotated(boxes: Tensor, scores: Tensor, iou_threshold: float, *, degrees: bool = True) -> Tensor:
+    """`rotated_nms` of boxes (M, 5) as `box_iou_rotated` has them: indices (K,) int64 kept, best score first.
+
+    A box is dropped iff its IoU with a kept better box is above the threshold.
+    """
+    _check_scored(boxes, scores, iou_threshold, 5)
+    return _nms(_upright(boxes.detach(), degrees), scores.detach(), None, float(iou_threshold))
+
+
+def batched_nms_rotated(
+    boxes: Tensor, scores: Tensor, idxs: Tensor, iou_threshold: float, *, degrees: bool = True
+) -> Tensor:
+    """`nms_rotated` in which a box is dropped only by a better one of the same group (a class, an image).
+
+    idxs: (M,) int32 or int64, the group of each box
+
+    Returns the indices (K,) int64 kept of all groups, best score first. The boxes are compared where they are, not
+    moved apart group by group, so that the result is that of one `nms_rotated` a group to the bit.
+    """
+    _check_scored(boxes, scores, iou_threshold, 5)
+    check_tensor("idxs", idxs, (torch.int32, torch.int64), (boxes.shape[0],), like=boxes)
+    return _nms(_upright(boxes.detach(), degrees), scores.detach(), idxs.long(), float(iou_threshold))
+
+
+def _upright(boxes: Tensor, degrees: bool) -> Tensor:
+    """Boxes (M, 7) of (cx, cy, w, h, angle) (M, 5).
+
+    Where y points down, counter-clockwise is a negative yaw. The sign is of no matter to a box alone, but it is to two
+    of them with different centres.
+    """
+    angle = torch.deg2rad(boxes[:, 4:]) if degrees else boxes[:, 4:]
+    flat = torch.zeros_like(angle)
+    return torch.cat((boxes[:, :2], flat, boxes[:, 2:4], flat, -angle), dim=1)
+
+
+def _check_pair(a: Tensor, b: Tensor, name_a: str = "a", name_b: str = "b", columns: int = 7) -> None:
+    check_tensor(name_a, a, FLOATS, (None, columns))
+    check_tensor(name_b, b, (a.dtype,), (None, columns), like=a)
+
+
+def _check_scored(boxes: Tensor, scores: Tensor, iou_threshold: float, columns: int) -> None:
+    check_tensor("boxes", boxes, FLOATS, (None, columns))
+    check_tensor("scores", scores, FLOATS, (boxes.shape[0],), like=boxes)
+    if not isinstance(iou_threshold, Real):
+        raise TypeError(f"iou_threshold: want a number, got {type(iou_threshold).__name__}")
+
+
+def _check_sizes(name: str, boxes: Tensor, count: int = 3) -> None:
+    """Checks that length, width and (count 3) height are not negative; NaN is let through. Reads the device."""
+    sizes = boxes[:, 3 : 3 + count]
+    if sizes.numel() and not sizes.min() >= 0:  # below 0, or NaN, which hides the others
+        smallest = sizes.nan_to_num(nan=0.0).min().item()
+        if smallest < 0:
+            raise ValueError(f"{name}: want sizes of 0 or more, got {smallest:g}")
+
+
+def _iou_outputs(a: Tensor, b: Tensor) -> Tensor:
+    return a.new_empty(a.shape[0], b.shape[0])
+
+
+@torch.library.custom_op("hvnet::rotated_iou_bev", mutates_args=())
+def _iou_bev(a: Tensor, b: Tensor) -> Tensor:
+    return _fill_matrix("matrix_bev", a, b)
+
+
+@torch.library.custom_op("hvnet::rotated_iou_3d", mutates_args=())
+def _iou_3d(a: Tensor, b: Tensor) -> Tensor:
+    return _fill_matrix("matrix_3d", a, b)
+
+
+_iou_bev.register_fake(_iou_outputs)
+_iou_3d.register_fake(_iou_outputs)
+
+
+def _fill_matrix(name: str, a: Tensor, b: Tensor) -> Tensor:
+    _check_sizes("a", a)
+    _check_sizes("b", b)
+    iou = _iou_outputs(a, b)
     kernel = getattr(_kernels(WARP_FLOAT[a.dtype]), name)
-    launch(kernel, (len(a), len(b)), [array(a.contiguous()), array(b.contiguous()), array(iou)], a.device)
+    launch(kernel, iou.shape, [array(a.contiguous()), array(b.contiguous()), array(iou)], a.device)
     return iou
 
 
-def _check_pair(a: Tensor, b: Tensor, name_a: str = "a", name_b: str = "b") -> None:
-    check_tensor(name_a, a, FLOATS, (None, 7))
-    check_tensor(name_b, b, (a.dtype,), (None, 7), like=a)
+def _overlap_pairs_outputs(a: Tensor, b: Tensor) -> Tensor:
+    return a.new_empty(a.shape[0])
+
+
+@torch.library.custom_op("hvnet::rotated_overlap_pairs", mutates_args=())
+def _overlap_pairs(a: Tensor, b: Tensor) -> Tensor:
+    _check_sizes("a", a, 2)
+    _check_sizes("b", b, 2)
+    area = _overlap_pairs_outputs(a, b)
+    kernel = _kernels(WARP_FLOAT[a.dtype]).pairs
+    launch(kernel, len(a), [array(a.contiguous()), array(b.contiguous()), array(area)], a.device)
+    return area
+
+
+_overlap_pairs.register_fake(_overlap_pairs_outputs)
+
+
+def _nms_order_outputs(boxes: Tensor, scores: Tensor, iou_threshold: float) -> tuple[Tensor, Tensor]:
+    count = boxes.shape[0]
+    return boxes.new_empty(count, dtype=torch.int64), boxes.new_empty(count, dtype=torch.bool)
+
+
+@torch.library.custom_op("hvnet::nms_order", mutates_args=())
+def _nms_order(boxes: Tensor, scores: Tensor, iou_threshold: float) -> tuple[Tensor, Tensor]:
+    if boxes.device.type == "cpu":  # elsewhere it would be a read of the device
+        _check_sizes("boxes", boxes)
+    order, keep = _rank(boxes, scores, iou_threshold)
+    _suppress(boxes[order], iou_threshold, keep)
+    return order, keep
+
+
+_nms_order.register_fake(_nms_order_outputs)
+
+
+@torch.library.custom_op("hvnet::rotated_nms", mutates_args=())
+def _nms(boxes: Tensor, scores: Tensor, group: Tensor | None, iou_threshold: float) -> Tensor:
+    _check_sizes("boxes", boxes)
+    order, keep = _rank(boxes, scores, iou_threshold)
+    if group is None:
+        _suppress(boxes[order], iou_threshold, keep)
+    else:
+        group, by_group = torch.sort(group[order], stable=True)  # group after group, each with its best box first
+        sizes = torch.unique_consecutive(group, return_counts=True)[1].tolist()
+        keep_by_group = keep[by_group]
+        for rows, of_group in zip(boxes[order[by_group]].split(sizes), keep_by_group.split(sizes), strict=True):
+            _suppress(rows, iou_threshold, of_group)
+        keep[by_group] = keep_by_group
+    return order[keep]
+
+
+@_nms.register_fake
+def _(boxes: Tensor, scores: Tensor, group: Tensor | None, iou_threshold: float) -> Tensor:
+    return boxes.new_empty(torch.library.get_ctx().new_dynamic_size(), dtype=torch.int64)
+
+
+def _rank(boxes: Tensor, scores: Tensor, iou_threshold: float) -> tuple[Tensor, Tensor]:
+    """The indices of the boxes, best score first, and which of these may be kept: all but those of a NaN score."""
+    order, keep = _nms_order_outputs(boxes, scores, iou_threshold)
+    ranked = torch.empty_like(scores)
+    torch.sort(scores, descending=True, stable=True, out=(ranked, order))
+    torch.eq(ranked, ranked, out=keep)
+    return order, keep
+
+
+def _suppress(boxes: Tensor, iou_threshold: float, keep: Tensor) -> None:
+    """Greedy NMS of boxes (M, 7), the best first: one that is kept clears keep (M,) bool of the worse it overlaps."""
+    if boxes.device.type == "cpu":
+        _suppress_serially(boxes, iou_threshold, keep)
+    else:
+        _suppress_in_parallel(boxes, iou_threshold, keep)
+
+
+def _suppress_serially(boxes: Tensor, iou_threshold: float, keep: Tensor) -> None:
+    """One thread compares only boxes that are still there."""
+    dtype = WARP_FLOAT[boxes.dtype]
+    launch(_kernels(dtype).nms_greedy, 1, [array(boxes), dtype(iou_threshold), array(keep)], boxes.device)
+
+
+def _suppress_in_parallel(boxes: Tensor, iou_threshold: float, keep: Tensor) -> None:
+    """Many threads compare all pairs into a mask of bits, one thread sweeps it."""
+    dtype = WARP_FLOAT[boxes.dtype]
+    words = -(-len(boxes) // WORD)
+    mask = torch.empty(len(boxes), words, dtype=torch.int64, device=boxes.device)
+    removed = torch.zeros(words, dtype=torch.int64, device=boxes.device)
+    inputs = [array(boxes), dtype(iou_threshold), array(mask)]
+    launch(_kernels(dtype).nms_mask, (len(boxes), words), inputs, boxes.device)
+    launch(_nms_sweep, 1, [array(mask), array(removed), array(keep)], boxes.device)
+
+
+def _match_outputs(anchors: Tensor, boxes: Tensor, starts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    shape = (starts.shape[0] - 1, anchors.shape[0])
+    iou, match = anchors.new_empty(shape), anchors.new_empty(shape, dtype=torch.int64)
+    return iou, match, anchors.new_empty(boxes.shape[0], dtype=torch.int64)
+
+
+@torch.library.custom_op("hvnet::rotated_match", mutates_args=())
+def _match(anchors: Tensor, boxes: Tensor, starts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    ends = starts.tolist()
+    if ends[0] != 0 or ends[-1] != len(boxes) or any(end < start for start, end in pairwise(ends)):
+        raise ValueError(f"starts: want ascending values from 0 to {len(boxes)}, got {ends}")
+    _check_sizes("anchors", anchors)
+    _check_sizes("boxes", boxes)
+    iou, match, best = _match_outputs(anchors, boxes, starts)
+    best.fill_(-1)
+    inputs = [array(t.contiguous()) for t in (anchors, boxes, starts)] + [array(iou), array(match), array(best)]
+    launch(_kernels(WARP_FLOAT[anchors.dtype]).match, iou.shape, inputs, anchors.device)
+    best.copy_(torch.where(best < 0, best, 0x7FFFFFFF - (best & 0x7FFFFFFF)))  # from keys to anchors
+    return iou, match, best
+
+
+_match.register_fake(_match_outputs)

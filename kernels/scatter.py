@@ -34,62 +34,68 @@ class Segments(NamedTuple):
 
 
 def segments(index: Tensor, dim_size: int) -> Segments:
-    """The segments of an index (N,) int64 with values in [0, dim_size)."""
-    values, order = torch.sort(index, stable=True)
-    starts = torch.searchsorted(values, torch.arange(dim_size + 1, device=index.device))
-    return Segments(index, starts, order)
+    """The segments of an index (N,) int64 with values in [0, dim_size).
+
+    Raises TypeError or ValueError naming the argument; reads the device once.
+    """
+    check_tensor("index", index, (torch.int64,), (None,))
+    if dim_size < 0:
+        raise ValueError(f"dim_size: want 0 or more, got {dim_size}")
+    return Segments(index, *_segments(index, dim_size))
 
 
 def scatter_max(src: Tensor, index: Tensor, dim_size: int) -> tuple[Tensor, Tensor]:
     """Maximum of the rows of src (N, C) that share an index (N,): values (dim_size, C), arg-max (dim_size, C) int64.
 
     A tie goes to the largest point index, a NaN is the maximum of its row, an empty row has value 0 and arg-max N.
-    The gradient goes to the arg-max point alone. Raises TypeError or ValueError naming the argument.
+    The gradient goes to the arg-max point alone, and is differentiable itself (a gather). Raises TypeError or
+    ValueError naming the argument.
     """
-    return segment_max(src, _checked_segments(src, index, dim_size))
+    return segment_max(src, _segments_of(src, index, dim_size))
 
 
 def scatter_mean(src: Tensor, index: Tensor, dim_size: int) -> Tensor:
     """Mean of the rows of src (N, C) that share an index (N,): (dim_size, C); an empty row is 0 (Eq. 2's means)."""
-    return segment_mean(src, _checked_segments(src, index, dim_size))
+    return segment_mean(src, _segments_of(src, index, dim_size))
 
 
 def gather(src: Tensor, index: Tensor) -> Tensor:
     """The rows src[index]: (V, C) and (N,) int64 give (N, C); the gradient is a sum in a fixed order."""
     check_tensor("src", src, FLOATS, (None, None))
     check_tensor("index", index, (torch.int64,), (None,), like=src)
-    check_index("index", index, src.shape[0])
     return segment_gather(src, segments(index, src.shape[0]))
 
 
 def segment_max(src: Tensor, voxels: Segments) -> tuple[Tensor, Tensor]:
     """`scatter_max` over segments that are at hand: src (N, C) gives values and arg-max (V, C)."""
+    check_tensor("src", src, FLOATS, (voxels.voxel.shape[0], None), like=voxels.voxel)
     values, argmax = _segment_max(src, voxels.voxel, voxels.order, voxels.starts)
     return values, argmax.long()
 
 
 def segment_mean(src: Tensor, voxels: Segments) -> Tensor:
     """`scatter_mean` over segments that are at hand: src (N, C) gives (V, C)."""
+    check_tensor("src", src, FLOATS, (voxels.voxel.shape[0], None), like=voxels.voxel)
     count = voxels.starts.diff().clamp(min=1).unsqueeze(1)
     return _segment_sum(src, voxels.voxel, voxels.order, voxels.starts) / count
 
 
 def segment_gather(src: Tensor, voxels: Segments) -> Tensor:
     """`gather` over segments that are at hand: src (V, C) gives (N, C)."""
+    check_tensor("src", src, FLOATS, (voxels.starts.shape[0] - 1, None), like=voxels.voxel)
     return _gather(src, voxels.voxel, voxels.order, voxels.starts)
 
 
 def segment_add(base: Tensor, src: Tensor, voxels: Segments) -> Tensor:
     """base (N, C) plus the rows of src (V, C) that belong to its points, in one pass: base + segment_gather(src)."""
+    check_tensor("base", base, FLOATS, (voxels.voxel.shape[0], None), like=voxels.voxel)
+    check_tensor("src", src, (base.dtype,), (voxels.starts.shape[0] - 1, base.shape[1]), like=base)
     return _gather_add(base, src, voxels.voxel, voxels.order, voxels.starts)
 
 
-def _checked_segments(src: Tensor, index: Tensor, dim_size: int) -> Segments:
+def _segments_of(src: Tensor, index: Tensor, dim_size: int) -> Segments:
     check_tensor("src", src, FLOATS, (None, None))
     check_tensor("index", index, (torch.int64,), (src.shape[0],), like=src)
-    if dim_size < 0:
-        raise ValueError(f"dim_size: want 0 or more, got {dim_size}")
-    check_index("index", index, dim_size)
     return segments(index, dim_size)
 
 
@@ -97,7 +103,7 @@ def _checked_segments(src: Tensor, index: Tensor, dim_size: int) -> Segments:
 def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
     """The kernels for one floating type and vector length, in a module of their own."""
     vec = wp.types.vector(length=lanes, dtype=dtype)
-    places = wp.types.vector(length=lanes, dtype=wp.int32)  # as wide as float32: the lanes stay in step
+    int_vec = wp.types.vector(length=lanes, dtype=wp.int32)  # as wide as float32: the lanes stay in step
     sums = wp.types.vector(length=lanes, dtype=wp.float64)
     module = wp.Module(f"hvnet_scatter_{dtype.__name__}_{lanes}", None)
 
@@ -114,30 +120,30 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         order: wp.array(dtype=wp.int64),
         starts: wp.array(dtype=wp.int64),
         values: wp.array2d(dtype=vec),
-        argmax: wp.array2d(dtype=places),
+        argmax: wp.array2d(dtype=int_vec),
     ):
         voxel, c = wp.tid()
         start = int(starts[voxel])
         end = int(starts[voxel + 1])
         best = vec()
-        at = places(src.shape[0])
+        of_best = int_vec(src.shape[0])
         if start < end:
             i = point_at(order, start)
             best = src[i, c]
-            at = places(i)
-        odd = best - best  # stays 0 unless a value is not finite
+            of_best = int_vec(i)
+        nonfinite = best - best  # stays 0 unless a value is not finite
         for k in range(start + 1, end):
             i = point_at(order, k)
             row = src[i, c]
-            odd += row - row
+            nonfinite += row - row
             for lane in range(lanes):
                 if row[lane] >= best[lane]:
                     best[lane] = row[lane]
-                    at[lane] = i
-        if wp.dot(odd, odd) != dtype(0.0):
-            at = places(-1)  # left to maximum_with_nan: its branches would slow down this loop fourfold
+                    of_best[lane] = i
+        if wp.dot(nonfinite, nonfinite) != dtype(0.0):
+            of_best = int_vec(-1)  # left to maximum_with_nan: its branches would slow down this loop fourfold
         values[voxel, c] = best
-        argmax[voxel, c] = at
+        argmax[voxel, c] = of_best
 
     @wp.kernel(enable_backward=False, module=module)
     def maximum_with_nan(
@@ -145,7 +151,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         order: wp.array(dtype=wp.int64),
         starts: wp.array(dtype=wp.int64),
         values: wp.array2d(dtype=vec),
-        argmax: wp.array2d(dtype=places),
+        argmax: wp.array2d(dtype=int_vec),
     ):
         voxel, c = wp.tid()
         if argmax[voxel, c][0] >= 0:
@@ -153,7 +159,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         start = int(starts[voxel])
         i = point_at(order, start)
         best = src[i, c]
-        at = places(i)
+        of_best = int_vec(i)
         for k in range(start + 1, int(starts[voxel + 1])):
             i = point_at(order, k)
             row = src[i, c]
@@ -161,24 +167,24 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
                 # a later point wins unless it is below, or the best is a NaN and it is not
                 if not (row[lane] < best[lane]) and (row[lane] != row[lane] or best[lane] == best[lane]):
                     best[lane] = row[lane]
-                    at[lane] = i
+                    of_best[lane] = i
         values[voxel, c] = best
-        argmax[voxel, c] = at
+        argmax[voxel, c] = of_best
 
     @wp.kernel(enable_backward=False, module=module)
     def maximum_backward(
         grad: wp.array2d(dtype=vec),
-        argmax: wp.array2d(dtype=places),
+        argmax: wp.array2d(dtype=int_vec),
         index: wp.array(dtype=wp.int64),
         grad_src: wp.array2d(dtype=vec),
     ):
         i, c = wp.tid()
         voxel = int(index[i])
         given = grad[voxel, c]
-        at = argmax[voxel, c]
+        of_best = argmax[voxel, c]
         taken = vec()
         for lane in range(lanes):
-            if at[lane] == i:
+            if of_best[lane] == i:
                 taken[lane] = given[lane]
         grad_src[i, c] = taken
 
@@ -224,12 +230,34 @@ def _order_array(order: Tensor | None, like: Tensor) -> Any:
     return array(like.new_empty(0) if order is None else order.contiguous())
 
 
+def _segments_outputs(index: Tensor, dim_size: int) -> tuple[Tensor, Tensor]:
+    return index.new_empty(dim_size + 1), index.new_empty(index.shape[0])
+
+
+@torch.library.custom_op("hvnet::segments", mutates_args=())
+def _segments(index: Tensor, dim_size: int) -> tuple[Tensor, Tensor]:
+    """The starts and the order of `Segments`."""
+    starts, order = _segments_outputs(index, dim_size)
+    values = torch.empty_like(order)
+    torch.sort(index, stable=True, out=(values, order))
+    check_index("index", values[:: max(len(values) - 1, 1)], dim_size)  # the least and the largest
+    torch.searchsorted(values, torch.arange(dim_size + 1, device=index.device), out=starts)
+    return starts, order
+
+
+_segments.register_fake(_segments_outputs)
+
+
+def _segment_max_outputs(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> tuple[Tensor, Tensor]:
+    shape = (starts.shape[0] - 1, src.shape[1])
+    return src.new_empty(shape), src.new_empty(shape, dtype=torch.int32)
+
+
 @torch.library.custom_op("hvnet::segment_max", mutates_args=())
 def _segment_max(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> tuple[Tensor, Tensor]:
     count, lanes = src.shape[1], lanes_of(src.shape[1])
-    values = src.new_empty(starts.shape[0] - 1, count)
-    argmax = torch.empty(starts.shape[0] - 1, count, dtype=torch.int32, device=src.device)
-    inputs = [channels(src.contiguous(), lanes), _order_array(order, starts), array(starts)]
+    values, argmax = _segment_max_outputs(src, index, order, starts)
+    inputs = [channels(src.contiguous(), lanes), _order_array(order, starts), array(starts.contiguous())]
     inputs += [channels(values, lanes), channels(argmax, lanes)]
     kernels = _kernels(WARP_FLOAT[src.dtype], lanes)
     launch(kernels.maximum, (values.shape[0], count // lanes), inputs, src.device)
@@ -237,65 +265,72 @@ def _segment_max(src: Tensor, index: Tensor, order: Tensor | None, starts: Tenso
     return values, argmax
 
 
-@_segment_max.register_fake
-def _(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> tuple[Tensor, Tensor]:
-    values = src.new_empty(starts.shape[0] - 1, src.shape[1])
-    return values, torch.empty_like(values, dtype=torch.int32)
+_segment_max.register_fake(_segment_max_outputs)
+
+
+def _segment_max_backward_outputs(grad: Tensor, argmax: Tensor, index: Tensor) -> Tensor:
+    return grad.new_empty(index.shape[0], grad.shape[1])
 
 
 @torch.library.custom_op("hvnet::segment_max_backward", mutates_args=())
 def _segment_max_backward(grad: Tensor, argmax: Tensor, index: Tensor) -> Tensor:
     count, lanes = grad.shape[1], lanes_of(grad.shape[1])
-    grad_src = grad.new_empty(index.shape[0], count)
-    inputs = [channels(grad.contiguous(), lanes), channels(argmax, lanes), array(index.contiguous())]
+    grad_src = _segment_max_backward_outputs(grad, argmax, index)
+    inputs = [channels(grad.contiguous(), lanes), channels(argmax.contiguous(), lanes), array(index.contiguous())]
     inputs += [channels(grad_src, lanes)]
     kernel = _kernels(WARP_FLOAT[grad.dtype], lanes).maximum_backward
     launch(kernel, (index.shape[0], count // lanes), inputs, grad.device)
     return grad_src
 
 
-@_segment_max_backward.register_fake
-def _(grad: Tensor, argmax: Tensor, index: Tensor) -> Tensor:
-    return grad.new_empty(index.shape[0], grad.shape[1])
+_segment_max_backward.register_fake(_segment_max_backward_outputs)
+
+
+def _segment_sum_outputs(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
+    return src.new_empty(starts.shape[0] - 1, src.shape[1])
 
 
 @torch.library.custom_op("hvnet::segment_sum", mutates_args=())
 def _segment_sum(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
     count, lanes = src.shape[1], lanes_of(src.shape[1])
-    values = src.new_empty(starts.shape[0] - 1, count)
-    inputs = [channels(src.contiguous(), lanes), _order_array(order, starts), array(starts), channels(values, lanes)]
+    values = _segment_sum_outputs(src, index, order, starts)
+    inputs = [channels(src.contiguous(), lanes), _order_array(order, starts), array(starts.contiguous())]
+    inputs += [channels(values, lanes)]
     launch(_kernels(WARP_FLOAT[src.dtype], lanes).total, (values.shape[0], count // lanes), inputs, src.device)
     return values
 
 
-@_segment_sum.register_fake
-def _(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
-    return src.new_empty(starts.shape[0] - 1, src.shape[1])
+_segment_sum.register_fake(_segment_sum_outputs)
+
+
+def _gather_outputs(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
+    return src.new_empty(index.shape[0], src.shape[1])
 
 
 @torch.library.custom_op("hvnet::gather", mutates_args=())
 def _gather(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
-    return src.index_select(0, index)  # a plain slice is fast enough, as the paper says; its own gradient is not
+    # a plain slice is fast enough, as the paper says; its own gradient is not
+    return torch.index_select(src, 0, index, out=_gather_outputs(src, index, order, starts))
 
 
-@_gather.register_fake
-def _(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
-    return src.new_empty(index.shape[0], src.shape[1])
+_gather.register_fake(_gather_outputs)
+
+
+def _gather_add_outputs(base: Tensor, src: Tensor, voxel: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
+    return base.new_empty(base.shape)
 
 
 @torch.library.custom_op("hvnet::gather_add", mutates_args=())
 def _gather_add(base: Tensor, src: Tensor, voxel: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
     count, lanes = base.shape[1], lanes_of(base.shape[1])
-    values = torch.empty_like(base, memory_format=torch.contiguous_format)
+    values = _gather_add_outputs(base, src, voxel, order, starts)
     inputs = [channels(base.contiguous(), lanes), channels(src.contiguous(), lanes), array(voxel.contiguous())]
     inputs += [channels(values, lanes)]
     launch(_kernels(WARP_FLOAT[base.dtype], lanes).gather_add, (base.shape[0], count // lanes), inputs, base.device)
     return values
 
 
-@_gather_add.register_fake
-def _(base: Tensor, src: Tensor, voxel: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
-    return torch.empty_like(base)
+_gather_add.register_fake(_gather_add_outputs)
 
 
 def _save_max(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:
@@ -306,6 +341,16 @@ def _save_max(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:
 def _max_backward(ctx: Any, grad: Tensor, _: Any) -> tuple[Tensor, None, None, None]:
     argmax, index = ctx.saved_tensors
     return _segment_max_backward(grad, argmax, index), None, None, None
+
+
+def _save_argmax(ctx: Any, inputs: tuple, output: Tensor) -> None:
+    ctx.save_for_backward(inputs[1])
+
+
+def _max_double_backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+    (argmax,) = ctx.saved_tensors
+    padded = torch.cat((grad, grad.new_zeros(1, grad.shape[1])))  # an empty row's arg-max is N
+    return padded.gather(0, argmax.long()), None, None
 
 
 def _save_segments(ctx: Any, inputs: tuple, output: Tensor) -> None:
@@ -330,5 +375,6 @@ def _gather_add_backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None, 
 
 _gather_add.register_autograd(_gather_add_backward, setup_context=_save_added)
 _segment_max.register_autograd(_max_backward, setup_context=_save_max)
+_segment_max_backward.register_autograd(_max_double_backward, setup_context=_save_argmax)
 _segment_sum.register_autograd(_sum_backward, setup_context=_save_segments)
 _gather.register_autograd(_gather_backward, setup_context=_save_segments)

@@ -83,7 +83,17 @@ def cursors(points: Tensor, sample: Tensor, grid: Grid) -> Tensor:
     cells and z in [z_min, z_max); a point that is not finite is outside.
     """
     _check_points(points, sample)
-    cursor = torch.empty(len(points), dtype=torch.int64, device=points.device)
+    return _cursors(points.detach(), sample, _numbers([grid]))
+
+
+def _cursors_outputs(points: Tensor, sample: Tensor, flat: Sequence[float]) -> Tensor:
+    return sample.new_empty(points.shape[0])
+
+
+@torch.library.custom_op("hvnet::cursors", mutates_args=())
+def _cursors(points: Tensor, sample: Tensor, flat: Sequence[float]) -> Tensor:
+    (grid,) = _grids(flat)
+    cursor = _cursors_outputs(points, sample, flat)
     inputs = [
         array(points.contiguous(), 4),
         array(sample.contiguous()),
@@ -99,6 +109,9 @@ def cursors(points: Tensor, sample: Tensor, grid: Grid) -> Tensor:
     return cursor
 
 
+_cursors.register_fake(_cursors_outputs)
+
+
 def voxel_index(points: Tensor, sample: Tensor, batch_size: int, grids: Sequence[Grid]) -> VoxelIndex:
     """The voxels of points (N, 4) float32 of samples (N,) int64 in [0, batch_size) at every scale.
 
@@ -109,8 +122,7 @@ def voxel_index(points: Tensor, sample: Tensor, batch_size: int, grids: Sequence
     _check_points(points, sample)
     if not grids:
         raise ValueError("grids: want at least one grid, got none")
-    flat = [float(value) for grid in grids for value in (*grid[:4], *grid.cell, *grid.cells, *grid.shape)]
-    order, *parts = _voxel_index(points, sample, batch_size, flat)
+    order, *parts = _voxel_index(points, sample, batch_size, _numbers(grids))
     width = len(parts) // len(grids)  # 3, or 4 with an order of its own
     scales = [parts[k : k + width] for k in range(0, len(parts), width)]
     return VoxelIndex(order, [Voxels(s[0], Segments(s[1], s[2], s[3] if width == 4 else None)) for s in scales])
@@ -153,8 +165,13 @@ def _(points: Tensor, sample: Tensor, batch_size: int, flat: Sequence[float]) ->
     return parts
 
 
+def _numbers(grids: Sequence[Grid]) -> list[float]:
+    """Ten numbers a grid, all in a row: an op takes no tuple."""
+    return [float(value) for grid in grids for value in (*grid[:4], *grid.cell, *grid.cells, *grid.shape)]
+
+
 def _grids(flat: Sequence[float]) -> list[Grid]:
-    """The grids whose ten numbers stand in a row."""
+    """The grids of `_numbers`."""
     rows = [flat[k : k + 10] for k in range(0, len(flat), 10)]
     return [Grid(r[0], r[1], r[2], r[3], (r[4], r[5]), (int(r[6]), int(r[7])), (int(r[8]), int(r[9]))) for r in rows]
 
@@ -181,7 +198,8 @@ def nested_index(points: Tensor, sample: Tensor, grids: Sequence[Grid]) -> Neste
 @functools.cache
 def _nesting(grids: tuple[Grid, ...], device: torch.device) -> tuple[list[object], Tensor, int]:
     """What the kernels want of grids that nest: the finest grid, then of every scale (S, 3) the bits of a Morton key to
-    drop, N_L and N_W, and the bits of a key. Kept, so that a frame copies nothing to a GPU."""
+    drop, N_L and N_W, and the bits of a key. Cached so that no frame triggers a
+    host-to-device copy."""
     finest = min(grids, key=lambda grid: grid.cell)
     levels = [_level(grid, finest) or 0 for grid in grids]
     # inside every grid: the finest index, cut to a coarser grid's cells, is compared with each
@@ -238,6 +256,11 @@ def hash_index(cursor: Tensor) -> tuple[Tensor, Tensor]:
     Open addressing; the table's layout depends on the order of insertion, and sorting the voxels removes that.
     """
     check_tensor("cursor", cursor, (torch.int64,), (None,))
+    return _hash_index(cursor)
+
+
+@torch.library.custom_op("hvnet::hash_index", mutates_args=())
+def _hash_index(cursor: Tensor) -> tuple[Tensor, Tensor]:
     check_index("cursor", cursor, 2**63)
     capacity = 1 << max(2 * len(cursor) - 1, 1).bit_length()
     table = torch.full((capacity,), -1, dtype=torch.int64, device=cursor.device)
@@ -249,12 +272,17 @@ def hash_index(cursor: Tensor) -> tuple[Tensor, Tensor]:
     return unique, table[slot]
 
 
+@_hash_index.register_fake
+def _(cursor: Tensor) -> tuple[Tensor, Tensor]:
+    return cursor.new_empty(torch.library.get_ctx().new_dynamic_size()), cursor.new_empty(cursor.shape[0])
+
+
 def _hashed_voxels(cursor: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Cursors (V,) in ascending order, and the segments of the points (voxel, starts, order)."""
     unique, index = hash_index(cursor)
-    at = segments(index, len(unique))
-    assert at.order is not None
-    return unique, at.voxel, at.starts, at.order
+    voxels = segments(index, len(unique))
+    assert voxels.order is not None
+    return unique, voxels.voxel, voxels.starts, voxels.order
 
 
 def _check_points(points: Tensor, sample: Tensor) -> None:
@@ -429,9 +457,9 @@ def _serial_kernel(
         while i < kept:
             word = work[side, i]
             d = int((word >> (shift + wp.int64(32))) & wp.int64(DIGITS - 1))
-            at = int(digits[d])
-            digits[d] = wp.int64(at + 1)
-            work[1 - side, at] = word
+            position = int(digits[d])
+            digits[d] = wp.int64(position + 1)
+            work[1 - side, position] = word
             i += 1
         side = 1 - side
         shift += wp.int64(DIGIT_BITS)

@@ -58,6 +58,19 @@ def test_gradcheck(relu: bool, keep: bool, device: torch.device) -> None:
     assert torch.autograd.gradcheck(outputs, (features.requires_grad_(), layer.requires_grad_()))
 
 
+def test_second_derivatives(device: torch.device) -> None:
+    """Of sums and images; the product of `attend` has none, and says so."""
+    rows = torch.randn(4, 3, dtype=torch.float64, device=device, requires_grad=True)
+    cursor = torch.tensor([5, 0, 3, 8], device=device)
+    assert torch.autograd.gradgradcheck(lambda x: [sums.sin() for sums in column_sums(x)], rows)
+    assert torch.autograd.gradgradcheck(lambda x: write_image(x, cursor, 9).sin(), rows)
+    features, points, mean, layer, at = case(12, 5, 3, torch.float64, device, ordered=False)
+    values = attend(features.requires_grad_(), points, mean, layer, at)[1]
+    (grad,) = torch.autograd.grad(values.square().sum(), features, create_graph=True)
+    with pytest.raises(RuntimeError, match="attend_backward"):
+        grad.sum().backward()
+
+
 def test_float32_is_near_float64(device: torch.device) -> None:
     features, points, mean, layer, at = case(500, 90, 64, torch.float64, device, ordered=True)
     want = attend(features, points, mean, layer, at)
@@ -142,22 +155,41 @@ def test_bad_arguments() -> None:
         attend(features, points, mean, layer[:8], at)
 
 
-def test_opcheck() -> None:
+def test_opcheck(device: torch.device) -> None:
     """torch.library's own checks of the ops: schema, fake tensors, autograd registration, compilation."""
-    features, points, mean, layer, at = case(20, 6, 16, torch.float32, torch.device("cpu"), ordered=False)
+    features, points, mean, layer, at = case(20, 6, 16, torch.float32, device, ordered=False)
     inputs = features.requires_grad_(), points, mean, layer.requires_grad_()
+    ops = torch.ops.hvnet
     for order in (at.order, None):
-        torch.library.opcheck(torch.ops.hvnet.attend, (*inputs, order, at.starts, False, True))
-    src = torch.randn(20, 5, requires_grad=True)
-    for op in (torch.ops.hvnet.segment_max, torch.ops.hvnet.segment_sum):
-        torch.library.opcheck(op, (src, at.voxel, at.order, at.starts))
-    added = torch.randn(20, 5, requires_grad=True), torch.randn(6, 5, requires_grad=True)
-    torch.library.opcheck(torch.ops.hvnet.gather_add, (*added, at.voxel, at.order, at.starts))
-    torch.library.opcheck(torch.ops.hvnet.write_image, (added[1], torch.tensor([5, 0, 3, 8, 1, 2]), 9))
-    torch.library.opcheck(torch.ops.hvnet.column_sums, (src,))
-    torch.library.opcheck(
-        torch.ops.hvnet.gather, (torch.randn(6, 5, requires_grad=True), at.voxel, at.order, at.starts)
-    )
+        for keep in (True, False):
+            torch.library.opcheck(ops.attend, (*inputs, order, at.starts, False, keep))
+    given = [tensor.detach() for tensor in (*ops.attend(*inputs, at.order, at.starts, True, True),)]
+    for grad_product in (given[0], None):
+        tensors = (grad_product, given[1], *(tensor.detach() for tensor in inputs), at.order, at.starts, given[2])
+        torch.library.opcheck(ops.attend_backward, (*tensors, True))
+    rows = torch.randn(6, 5, device=device, requires_grad=True)
+    torch.library.opcheck(ops.write_image, (rows, torch.tensor([5, 0, 3, 8, 1, 2], device=device), 9))
+    torch.library.opcheck(ops.column_sums, (rows,))
+
+
+def test_compiles_into_one_graph() -> None:
+    """Forward and backward. aot_eager needs no C++ compiler."""
+
+    def function(features: Tensor, points: Tensor, mean: Tensor, layer: Tensor, at: Segments) -> tuple[Tensor, ...]:
+        product, values = attend(features, points, mean, layer, at)
+        image = write_image(values, torch.arange(len(values)) * 2, 2 * len(values))
+        return (image, knowledge(points, mean, at.voxel), *column_sums(product))
+
+    compiled = torch.compile(function, fullgraph=True, backend="aot_eager", dynamic=True)
+    for count in (40, 30):
+        arguments = case(count, 9, 16, torch.float64, torch.device("cpu"), ordered=False)
+        leaves = arguments[0].requires_grad_(), arguments[3].requires_grad_()
+        results = []
+        for each in (function, compiled):
+            outputs = each(*arguments)
+            results.append((*outputs, *torch.autograd.grad(sum(out.sum() for out in outputs), leaves)))
+        for expected, actual in zip(*results, strict=True):
+            torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_segments_are_those_of_the_hash_table() -> None:

@@ -150,6 +150,30 @@ def test_wrong_arguments_are_named(change: dict[str, object], error: type[Except
         raycast(**(arguments | change))  # type: ignore[arg-type]
 
 
+def test_no_gradients(device: torch.device) -> None:
+    vertices, faces = soup(20, 4, device)
+    origins, directions = rays(30, 5, device)
+    distance, face, normal = raycast(vertices.requires_grad_(), faces, origins.requires_grad_(), directions, 9.0)
+    assert not any(result.requires_grad for result in (distance, face, normal))
+
+
+def test_opcheck(device: torch.device) -> None:
+    for count in (20, 0):
+        torch.library.opcheck(torch.ops.hvnet.raycast, (*soup(count, 4, device), *rays(30, 5, device), 9.0))
+
+
+def test_compiles_into_one_graph() -> None:
+    """Its checks of the data too. aot_eager needs no C++ compiler."""
+    compiled = torch.compile(raycast, fullgraph=True, backend="aot_eager", dynamic=True)
+    cpu = torch.device("cpu")
+    for count in (20, 30):
+        arguments = (*soup(count, 6, cpu), *rays(2 * count, 7, cpu), 9.0)
+        for got, expected in zip(compiled(*arguments), raycast(*arguments), strict=True):
+            assert got.equal(expected)
+    with pytest.raises(ValueError, match=r"directions.*length 1"):
+        compiled(*arguments[:3], 2 * arguments[3], 9.0)
+
+
 def test_importing_and_casting_print_nothing() -> None:
     code = (
         "import torch; from hvnet.kernels.raycast import raycast;"

@@ -1,6 +1,10 @@
 """Rotated IoU, NMS and matching against shapely in float64, hand-made cases and their twins."""
 
 import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -247,6 +251,19 @@ def test_nms_equals_twin(count: int, threshold: float, dtype: torch.dtype, devic
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("count", [0, 1, 64, 65, 300])
+def test_nms_of_one_thread_and_of_many(count: int, dtype: torch.dtype, device: torch.device) -> None:
+    """The CPU goes through the boxes in one thread, a GPU masks them in many: here both ways on one device."""
+    boxes = random_boxes(count, 26, spread=8).to(device, dtype)
+    keep = torch.rand(count, generator=torch.Generator().manual_seed(0)).to(device) > 0.2  # some have a NaN score
+    serial, parallel = keep.clone(), keep.clone()
+    rotated._suppress_serially(boxes, 0.1, serial)
+    rotated._suppress_in_parallel(boxes, 0.1, parallel)
+    assert torch.equal(serial, parallel)
+    assert not (serial & ~keep).any()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
 def test_nms_by_hand(dtype: torch.dtype, device: torch.device) -> None:
     def kept(boxes: list[Tensor], scores: list[float], threshold: float) -> list[int]:
         given = torch.cat(boxes).to(device, dtype), torch.tensor(scores, dtype=dtype, device=device)
@@ -261,6 +278,8 @@ def test_nms_by_hand(dtype: torch.dtype, device: torch.device) -> None:
     assert kept(same, [-0.0, 0.0, -0.0, 0.0], 0.5) == [0]  # zeros are equal
     assert kept(same, [0.5, 0.7, 0.7, 0.1], 0.5) == [1]
     assert kept(same, [0.1, 0.2, 0.3, 0.4], 1.0) == [3, 2, 1, 0]  # an IoU of 1 is not above 1
+    assert kept(same, [math.nan, 0.2, math.nan, 0.4], 0.5) == [3]  # NaN is never kept, and drops nothing
+    assert kept(same, [math.nan] * 4, 0.5) == []
     apart = [box(10.0 * k, 0, 4, 2) for k in range(6)]
     assert kept(apart, [1, 2, 2, 0, 2, 1], 0.5) == [1, 2, 4, 0, 5, 3]
     assert kept(apart, [0, math.inf, -math.inf, -5, 5, 0], 0.5) == [1, 4, 0, 5, 3, 2]
@@ -391,3 +410,277 @@ def test_bad_match() -> None:
     for wrong in ([0, 1], [1, 2], [0, 2, 1, 2], [0, 3], []):
         with pytest.raises(ValueError, match="starts"):
             rotated.rotated_match(anchors, boxes, torch.tensor(wrong, dtype=torch.int64))
+
+
+def test_bad_threshold() -> None:
+    for function, columns in ((rotated.rotated_nms, 7), (rotated.nms_order, 7), (rotated.nms_rotated, 5)):
+        with pytest.raises(TypeError, match=r"iou_threshold.*str"):
+            function(torch.ones(3, columns), torch.ones(3), "0.5")
+
+
+@pytest.mark.parametrize("name", ["rotated_iou_bev", "rotated_iou_3d", "rotated_overlap_pairs"])
+def test_negative_size_of_pairs(name: str, device: torch.device) -> None:
+    function, good = getattr(rotated, name), random_boxes(3, 20).to(device)
+    for column in range(3, 6):
+        bad = good.clone()
+        bad[1, column] = -1.5
+        bad[0, 3] = math.nan  # hides nothing
+        if column == 5 and name == "rotated_overlap_pairs":  # an area has no height
+            assert torch.equal(function(bad, good), function(bad[:, [0, 1, 2, 3, 4, 3, 6]], good))
+            continue
+        with pytest.raises(ValueError, match=r"\ba\b.*0 or more.*-1\.5"):
+            function(bad, good)
+        with pytest.raises(ValueError, match=r"\bb\b.*0 or more.*-1\.5"):
+            function(good, bad)
+    assert function(good * 0, good * -0.0).sum() == 0  # zeros of either sign are no negative sizes
+
+
+def test_negative_size_of_many(device: torch.device) -> None:
+    good, scores, starts = random_boxes(3, 21).to(device), torch.ones(3, device=device), torch.tensor([0, 3])
+    for column in range(3, 6):
+        bad = good.clone()
+        bad[2, column] = -1.0
+        with pytest.raises(ValueError, match=r"boxes.*-1"):
+            rotated.rotated_nms(bad, scores, 0.5)
+        with pytest.raises(ValueError, match=r"anchors.*-1"):
+            rotated.rotated_match(bad, good, starts.to(device))
+        with pytest.raises(ValueError, match=r"boxes.*-1"):
+            rotated.rotated_match(good, bad, starts.to(device))
+        if device.type == "cpu":  # on a GPU nms_order reads nothing
+            with pytest.raises(ValueError, match=r"boxes.*-1"):
+                rotated.nms_order(bad, scores, 0.5)
+
+
+def test_nms_order_has_fixed_sizes(device: torch.device) -> None:
+    boxes = random_boxes(50, 22, spread=6).to(device)
+    scores = torch.rand(50, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).to(device)
+    scores[7] = math.nan
+    order, keep = rotated.nms_order(boxes, scores, 0.1)
+    assert order.shape == keep.shape == (50,)
+    assert (order.dtype, keep.dtype) == (torch.int64, torch.bool)
+    assert order[0] == 7
+    assert not keep[0]
+    assert torch.equal(order[keep], rotated.rotated_nms(boxes, scores, 0.1))
+
+
+def image_boxes(count: int, seed: int) -> Tensor:
+    """Boxes (count, 5) float64 of (cx, cy, w, h, angle) in pixels and degrees."""
+    generator = np.random.default_rng(seed)
+    columns = [generator.uniform(0, 60, (count, 2)), generator.uniform(5, 40, (count, 2))]
+    return torch.from_numpy(np.concatenate([*columns, generator.uniform(-400, 400, (count, 1))], axis=1))
+
+
+def image_polygons(boxes: Tensor) -> np.ndarray:
+    """Shapely polygons (M,) of boxes (M, 5), by the formula in the documentation of detectron2's RotatedBoxes."""
+    corners = []
+    for x_c, y_c, w, h, angle in boxes.double().tolist():
+        theta, found = angle * math.pi / 180, []
+        for x, y in ((-w / 2, -h / 2), (w / 2, -h / 2), (w / 2, h / 2), (-w / 2, h / 2)):  # less the centre
+            y_r = math.cos(theta) * y - math.sin(theta) * x + y_c
+            x_r = math.sin(theta) * y + math.cos(theta) * x + x_c
+            found.append((x_r, y_r))
+        corners.append(found)
+    return shapely.polygons(corners)
+
+
+def image_iou(a: Tensor, b: Tensor) -> Tensor:
+    first, second = image_polygons(a)[:, None], image_polygons(b)[None]
+    shared = shapely.area(shapely.intersection(first, second))
+    return torch.from_numpy(shared / (shapely.area(first) + shapely.area(second) - shared))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_box_iou_rotated(dtype: torch.dtype, device: torch.device) -> None:
+    a, b = image_boxes(60, 0).to(dtype), image_boxes(50, 1).to(dtype)
+    expected = image_iou(a, b)
+    assert (expected > 0.2).any()
+    assert (image_iou(a * torch.tensor([1, 1, 1, 1, -1]), b) - expected).abs().max() > 0.1  # the sign matters
+    tolerance = 10 * TOLERANCE[dtype]  # an angle of 400 degrees is rounded to 5e-7 radians
+    iou = rotated.box_iou_rotated(a.to(device), b.to(device))
+    assert iou.dtype == dtype
+    equals(iou, expected, tolerance)
+    equals(iou, reference.box_iou_rotated(a.double(), b.double()), tolerance)
+    a[:, 4], b[:, 4] = a[:, 4].deg2rad(), b[:, 4].deg2rad()
+    equals(rotated.box_iou_rotated(a.to(device), b.to(device), degrees=False), expected, tolerance)
+    equals(reference.box_iou_rotated(a.double(), b.double(), degrees=False), expected, tolerance)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("function", [rotated.box_iou_rotated, reference.box_iou_rotated])
+def test_box_iou_rotated_by_hand(function: Callable[..., Tensor], dtype: torch.dtype, device: torch.device) -> None:
+    """The boxes that detectron2's documentation draws, and two of which only one turn makes them meet."""
+    upright = torch.tensor([[5, 3, 4, 2, 0]], dtype=dtype, device=device)
+    turned = torch.tensor([[5.0, 3, 4, 2, angle] for angle in (0, 90, -90, 180, 360)], dtype=dtype, device=device)
+    equals(function(upright, turned), torch.tensor([[1, 1 / 3, 1 / 3, 1, 1]]), 1e-6)
+    # as it is seen, a long box turned by 45 degrees goes from the lower left to the upper right, where y is less
+    long = torch.tensor([[0, 0, 10, 1, 45.0]], dtype=dtype, device=device)
+    corners = torch.tensor([[3.0, -3, 1, 1, 45], [3, 3, 1, 1, 45]], dtype=dtype, device=device)
+    equals(function(long, corners), torch.tensor([[0.1, 0]]), 1e-6)
+    radians = torch.tensor([[0, 0, 10, 1, math.pi / 4]], dtype=dtype, device=device)
+    corners[:, 4] = math.pi / 4
+    equals(function(radians, corners, degrees=False), torch.tensor([[0.1, 0]]), 1e-6)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("degrees", [True, False])
+def test_nms_rotated(degrees: bool, dtype: torch.dtype, device: torch.device) -> None:
+    boxes = image_boxes(80, 2)
+    assert not ((image_iou(boxes, boxes) - 0.3).abs() < 1e-5).any()  # no pair that rounding decides
+    scores = torch.rand(80, generator=torch.Generator().manual_seed(0)).to(dtype)
+    scores[3] = math.nan
+    overlaps, order = image_iou(boxes, boxes) > 0.3, [k for k in scores.argsort(descending=True).tolist() if k != 3]
+    expected: list[int] = []
+    for k in order:
+        if not any(overlaps[k, better] for better in expected):
+            expected.append(k)
+    assert 5 < len(expected) < 70
+    if not degrees:
+        boxes[:, 4] = boxes[:, 4].deg2rad()
+    kept = rotated.nms_rotated(boxes.to(device, dtype), scores.to(device), 0.3, degrees=degrees)
+    assert kept.dtype == torch.int64
+    assert kept.tolist() == expected
+    assert reference.nms_rotated(boxes, scores, 0.3, degrees=degrees).tolist() == expected
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("index_dtype", [torch.int32, torch.int64])
+@pytest.mark.parametrize("groups", [1, 4, 200])
+def test_batched_nms_rotated(groups: int, index_dtype: torch.dtype, dtype: torch.dtype, device: torch.device) -> None:
+    """One nms_rotated a group, merged by score; far boxes too, which a shift group by group would round."""
+    generator = torch.Generator().manual_seed(groups)
+    boxes = image_boxes(150, 3).to(dtype)
+    boxes[:, :2] += 1e4
+    scores = (torch.rand(150, generator=generator) * 20).round().to(dtype)  # many ties
+    scores[5] = math.nan
+    idxs = (torch.randint(groups, (150,), generator=generator) * 1_000_003 - 7).to(index_dtype)
+    given = boxes.to(device), scores.to(device), idxs.to(device)
+    kept = rotated.batched_nms_rotated(*given, 0.2)
+    merged = []
+    for group in idxs.unique().tolist():
+        members = (idxs == group).nonzero()[:, 0].to(device)
+        merged.append(members[rotated.nms_rotated(given[0][members], given[1][members], 0.2)])
+    expected = sorted(torch.cat(merged).tolist(), key=lambda k: (-scores[k].item(), k))
+    assert kept.dtype == torch.int64
+    assert kept.tolist() == expected
+    assert reference.batched_nms_rotated(boxes.double(), scores, idxs, 0.2).tolist() == expected
+    radians = torch.cat((given[0][:, :4], given[0][:, 4:].deg2rad()), dim=1)
+    assert rotated.batched_nms_rotated(radians, *given[1:], 0.2, degrees=False).tolist() == expected
+
+
+def test_batched_nms_by_hand(device: torch.device) -> None:
+    boxes = torch.tensor([[0, 0, 4, 2, 30.0]], device=device).repeat(5, 1)
+    scores = torch.tensor([0.1, 0.5, 0.5, 0.9, math.nan], device=device)
+    kept = rotated.batched_nms_rotated(boxes, scores, torch.tensor([2, 7, 2, 7, 9], device=device), 0.5)
+    assert kept.tolist() == [3, 2]
+    none = torch.zeros(0, 5, device=device)
+    for module in (rotated, reference):
+        empty = module.batched_nms_rotated(none, none[:, 0], torch.zeros(0, dtype=torch.int64, device=device), 0.5)
+        assert (empty.shape, empty.dtype) == ((0,), torch.int64)
+        assert module.nms_rotated(none, none[:, 0], 0.5).shape == (0,)
+        assert module.box_iou_rotated(none, boxes).shape == (0, 5)
+
+
+def test_example_of_the_docs() -> None:
+    text = (Path(__file__).resolve().parents[1] / "docs" / "kernels.md").read_text(encoding="utf-8")
+    (example,) = (
+        each for each in re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL) if "nms" in each
+    )
+    scope: dict[str, Tensor] = {}
+    exec(compile(example, "docs/kernels.md", "exec"), scope)
+    assert scope["kept"].tolist() == [0, 2]
+    equals(scope["iou"], image_iou(scope["boxes"], scope["boxes"]), 1e-5)
+
+
+def test_bad_image_boxes() -> None:
+    boxes, scores, idxs = torch.ones(3, 5), torch.ones(3), torch.zeros(3, dtype=torch.int64)
+    with pytest.raises(ValueError, match=r"\bb\b.*5.*7"):
+        rotated.box_iou_rotated(boxes, torch.ones(3, 7))
+    with pytest.raises(TypeError, match=r"\ba\b.*int64"):
+        rotated.box_iou_rotated(boxes.long(), boxes)
+    with pytest.raises(ValueError, match=r"\ba\b.*-1"):
+        rotated.box_iou_rotated(-boxes, boxes)
+    with pytest.raises(ValueError, match=r"boxes.*-1"):
+        rotated.nms_rotated(-boxes, scores, 0.5)
+    with pytest.raises(ValueError, match=r"scores.*2"):
+        rotated.nms_rotated(boxes, scores[:2], 0.5)
+    with pytest.raises(TypeError, match=r"idxs.*float32"):
+        rotated.batched_nms_rotated(boxes, scores, idxs.float(), 0.5)
+    with pytest.raises(ValueError, match=r"idxs.*2"):
+        rotated.batched_nms_rotated(boxes, scores, idxs[:2], 0.5)
+    with pytest.raises(TypeError):  # a bare boolean says nothing
+        rotated.box_iou_rotated(boxes, boxes, False)  # type: ignore[misc]
+
+
+def test_no_gradients(device: torch.device) -> None:
+    """Boxes that want a gradient are taken as they are, and what comes back wants none."""
+    boxes, scores = random_boxes(6, 23).to(device).requires_grad_(), torch.rand(6, device=device, requires_grad=True)
+    starts = torch.tensor([0, 6], device=device)
+    results = [
+        rotated.rotated_iou_bev(boxes, boxes),
+        rotated.rotated_iou_3d(boxes, boxes),
+        rotated.rotated_overlap_pairs(boxes, boxes),
+        rotated.rotated_nms(boxes, scores, 0.1),
+        *rotated.nms_order(boxes, scores, 0.1),
+        *rotated.rotated_match(boxes, boxes, starts),
+        rotated.box_iou_rotated(boxes[:, :5].abs(), boxes[:, :5].abs()),
+    ]
+    assert not any(result.requires_grad for result in results)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_opcheck(dtype: torch.dtype, device: torch.device) -> None:
+    """torch.library's own checks of the ops: schema, fake tensors, compilation with shapes that change."""
+    a, b = random_boxes(6, 24).to(device, dtype), random_boxes(5, 25).to(device, dtype)
+    scores, group = torch.rand(6, device=device), torch.tensor([0, 1, 1, 0, 0, 1], device=device)
+    ops = torch.ops.hvnet
+    for op, arguments in (
+        (ops.rotated_iou_bev, (a, b)),
+        (ops.rotated_iou_3d, (a, b)),
+        (ops.rotated_overlap_pairs, (a[:5], b)),
+        (ops.nms_order, (a, scores, 0.3)),
+        (ops.rotated_nms, (a, scores, None, 0.3)),
+        (ops.rotated_nms, (a, scores, group, 0.3)),
+        (ops.rotated_match, (a, b, torch.tensor([0, 2, 5], device=device))),
+    ):
+        torch.library.opcheck(op, arguments)
+
+
+def compiled_cases() -> dict[str, tuple[Callable[..., object], Callable[[int], tuple[Any, ...]]]]:
+    """Every public function with arguments for a number of boxes."""
+
+    def boxes(count: int) -> Tensor:
+        return random_boxes(count, count).float()
+
+    def scored(count: int) -> tuple[Tensor, Tensor]:
+        return boxes(count), torch.rand(count, generator=torch.Generator().manual_seed(count))
+
+    def in_image(count: int) -> tuple[Tensor, Tensor, Tensor]:
+        return image_boxes(count, count).float(), scored(count)[1], torch.arange(count) % 3
+
+    return {
+        "rotated_iou_bev": (rotated.rotated_iou_bev, lambda n: (boxes(n), boxes(n + 1))),
+        "rotated_iou_3d": (rotated.rotated_iou_3d, lambda n: (boxes(n), boxes(n + 1))),
+        "rotated_overlap_pairs": (rotated.rotated_overlap_pairs, lambda n: (boxes(n), boxes(n).flip(0))),
+        "rotated_nms": (rotated.rotated_nms, lambda n: (*scored(n), 1 / n)),
+        "nms_order": (rotated.nms_order, lambda n: (*scored(n), 1 / n)),
+        "rotated_match": (rotated.rotated_match, lambda n: (boxes(n + 7), boxes(n), torch.tensor([0, 3, n]))),
+        "box_iou_rotated": (rotated.box_iou_rotated, lambda n: (in_image(n)[0], in_image(n + 1)[0])),
+        "nms_rotated": (lambda b, s, _: rotated.nms_rotated(b, s, 0.2), in_image),
+        "batched_nms_rotated": (lambda b, s, i: rotated.batched_nms_rotated(b, s, i, 0.2, degrees=False), in_image),
+    }
+
+
+def test_compiled_cases_are_all() -> None:
+    public = {name for name, value in vars(rotated).items() if getattr(value, "__module__", None) == rotated.__name__}
+    assert {name for name in public if not name.startswith("_")} == set(compiled_cases())
+
+
+@pytest.mark.parametrize("name", compiled_cases())
+def test_compiles_into_one_graph(name: str) -> None:
+    """Without a graph break and without a flag of the user; aot_eager needs no C++ compiler."""
+    function, arguments = compiled_cases()[name]
+    compiled = torch.compile(function, fullgraph=True, backend="aot_eager", dynamic=True)
+    for count in (12, 9):
+        actual, expected = compiled(*arguments(count)), function(*arguments(count))
+        pairs = zip(actual, expected, strict=True) if isinstance(expected, tuple) else [(actual, expected)]
+        assert all(torch.equal(first, second) for first, second in pairs)

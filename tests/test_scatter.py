@@ -274,6 +274,85 @@ def test_gradcheck(channels: int, device: torch.device) -> None:
     assert torch.autograd.gradcheck(lambda x: scatter.gather(x, index), leaf)
 
 
+@pytest.mark.parametrize("channels", [1, 5])
+def test_second_derivatives(channels: int, device: torch.device) -> None:
+    """Also of tied values, where the first derivative has no finite difference, and with empty rows."""
+    generator = torch.Generator().manual_seed(0)
+    leaf = torch.randperm(20 * channels, generator=generator).reshape(20, channels).double().to(device)
+    leaf.requires_grad_()
+    index = torch.randint(6, (20,), generator=generator).to(device)
+
+    def largest(x: Tensor) -> Tensor:
+        return scatter.scatter_max(x, index, 8)[0]
+
+    assert torch.autograd.gradgradcheck(largest, leaf)
+    assert torch.autograd.gradgradcheck(lambda x: largest(x).sin(), leaf)
+    assert torch.autograd.gradgradcheck(lambda x: scatter.scatter_mean(x, index, 8).sin(), leaf)
+    assert torch.autograd.gradgradcheck(lambda x: scatter.gather(x, index).sin(), leaf)
+    none = torch.zeros(0, channels, dtype=torch.float64, device=device, requires_grad=True)
+    assert torch.autograd.gradgradcheck(lambda x: scatter.scatter_max(x, index[:0], 3)[0].sin(), none)
+
+    tied = (leaf % 3).detach().requires_grad_()
+    upstream = torch.randn(8, channels, dtype=torch.float64, generator=generator).to(device).requires_grad_()
+    weight = torch.randn(20, channels, dtype=torch.float64, generator=generator).to(device)
+    results = []
+    for function in (scatter.scatter_max, reference.scatter_max):
+        (first,) = torch.autograd.grad(function(tied, index, 8)[0], tied, upstream, create_graph=True)
+        results.append(torch.autograd.grad((first * weight).sum(), upstream)[0])
+    assert torch.equal(*results)
+
+
+def test_second_derivative_by_hand(device: torch.device) -> None:
+    """The gradient's gradient is a gather at the arg-max; an empty row's is 0."""
+    src = torch.tensor([[3.0, 1], [3, 5], [2, 2]], device=device, requires_grad=True)
+    values, argmax = scatter.scatter_max(src, torch.tensor([0, 0, 2], device=device), 3)
+    assert argmax.tolist() == [[1, 1], [3, 3], [2, 2]]
+    upstream = torch.ones(3, 2, device=device, requires_grad=True)
+    (grad,) = torch.autograd.grad(values, src, upstream, create_graph=True)
+    (second,) = torch.autograd.grad(grad, upstream, torch.tensor([[1.0, 2], [3, 4], [5, 6]], device=device))
+    assert second.tolist() == [[3, 4], [0, 0], [5, 6]]
+
+
+def test_opcheck(device: torch.device) -> None:
+    src, index, dim_size = random_case(20, 5, 6)
+    src, index = src.to(device).requires_grad_(), index.to(device)
+    rows = torch.randn(6, 5, dtype=torch.float64, device=device, requires_grad=True)
+    ops, voxels = torch.ops.hvnet, scatter.segments(index, dim_size)
+    torch.library.opcheck(ops.segments, (index, dim_size))
+    for order in (voxels.order, None):  # None: of a sorted index
+        at_hand = (index if order is not None else index.sort().values, order, voxels.starts)
+        torch.library.opcheck(ops.segment_max, (src, *at_hand))
+        torch.library.opcheck(ops.segment_sum, (src, *at_hand))
+        torch.library.opcheck(ops.gather, (rows, *at_hand))
+        torch.library.opcheck(ops.gather_add, (src, rows, *at_hand))
+    argmax = torch.ops.hvnet.segment_max(src.detach(), index, voxels.order, voxels.starts)[1]
+    torch.library.opcheck(ops.segment_max_backward, (rows, argmax, index))
+
+
+@pytest.mark.parametrize("name", ["scatter_max", "scatter_mean", "gather"])
+def test_compiles_into_one_graph(name: str) -> None:
+    """The check of the index too; forward and backward. aot_eager needs no C++ compiler."""
+
+    def function(src: Tensor, index: Tensor, dim_size: int) -> Tensor:
+        if name == "gather":
+            return scatter.gather(src, index)
+        result = getattr(scatter, name)(src, index, dim_size)
+        return result[0] * result[1] if name == "scatter_max" else result
+
+    compiled = torch.compile(function, fullgraph=True, backend="aot_eager", dynamic=True)
+    for case in (random_case(50, 16, 50), random_case(40, 16, 40)):
+        src, index, dim_size = case
+        expected, actual = function(*case), compiled(*case)
+        assert torch.equal(actual, expected)
+        upstream = torch.randn_like(expected)
+        assert torch.equal(
+            gradient(lambda x, case=case: compiled(x, *case[1:]), src, upstream),
+            gradient(lambda x, case=case: function(x, *case[1:]), src, upstream),
+        )
+    with pytest.raises(ValueError, match=r"index.*\[0, 40\)"):
+        compiled(src, index - 1, dim_size)
+
+
 def test_no_gradient_wanted(device: torch.device) -> None:
     src, index = torch.ones(3, 2, device=device, requires_grad=True), torch.tensor([0, 0, 1], device=device)
     with torch.no_grad():
@@ -397,6 +476,34 @@ def test_bad_size(function: Callable[[Tensor, Tensor, int], object]) -> None:
         function(torch.ones(3, 2), torch.zeros(3, dtype=torch.int64), -1)
     with pytest.raises(ValueError, match="index"):
         function(torch.ones(3, 2), torch.zeros(3, dtype=torch.int64), 0)
+
+
+def test_bad_rows_of_segments_at_hand() -> None:
+    """An index of these segments beyond src would be a read of foreign memory."""
+    voxels = scatter.segments(torch.tensor([0, 1, 1]), 2)
+    for function, rows in ((scatter.segment_max, 3), (scatter.segment_mean, 3), (scatter.segment_gather, 2)):
+        with pytest.raises(ValueError, match=rf"src.*\({rows}, any\).*\(1, 4\)"):
+            function(torch.ones(1, 4), voxels)
+        with pytest.raises(TypeError, match=r"src.*int64"):
+            function(torch.ones(rows, 4, dtype=torch.int64), voxels)
+    with pytest.raises(ValueError, match=r"base.*\(3, any\)"):
+        scatter.segment_add(torch.ones(2, 4), torch.ones(2, 4), voxels)
+    with pytest.raises(ValueError, match=r"src.*\(2, 4\)"):
+        scatter.segment_add(torch.ones(3, 4), torch.ones(3, 4), voxels)
+    with pytest.raises(TypeError, match=r"src.*float64"):
+        scatter.segment_add(torch.ones(3, 4), torch.ones(2, 4).double(), voxels)
+
+
+def test_bad_segments() -> None:
+    with pytest.raises(TypeError, match=r"index.*int32"):
+        scatter.segments(torch.zeros(3, dtype=torch.int32), 2)
+    with pytest.raises(ValueError, match=r"index.*\(any\)"):
+        scatter.segments(torch.zeros(3, 1, dtype=torch.int64), 2)
+    for wrong in (-1, 2):
+        with pytest.raises(ValueError, match=rf"index.*\[0, 2\).*{wrong}"):
+            scatter.segments(torch.tensor([0, wrong, 1]), 2)
+    with pytest.raises(ValueError, match=r"dim_size.*-1"):
+        scatter.segments(torch.zeros(0, dtype=torch.int64), -1)
 
 
 def test_index_out_of_range_on_the_device(device: torch.device) -> None:

@@ -472,3 +472,34 @@ def test_one_thread_and_many_give_the_same_index(scales: list[float], count: int
         assert torch.equal(serial.voxel[s, :kept], parallel.voxel[s, :kept].cpu())
         assert torch.equal(serial.starts[s, : v + 1], parallel.starts[s, : v + 1].cpu())
         assert torch.equal(serial.cursor[s, :v], parallel.cursor[s, :v].cpu())
+
+
+def test_opcheck(device: torch.device) -> None:
+    points, sample = cloud(200).to(device), (torch.arange(200) % 2).to(device)
+    (grid,) = grids_of([0.4])
+    numbers = voxel._numbers([grid])
+    torch.library.opcheck(torch.ops.hvnet.cursors, (points, sample, numbers))
+    torch.library.opcheck(torch.ops.hvnet.hash_index, (voxel.cursors(points, sample, grid).clamp(min=0),))
+    for scales in ([0.2, 0.4], [0.2, 0.3]):  # that nest, and that do not
+        numbers = voxel._numbers(grids_of(scales))
+        torch.library.opcheck(torch.ops.hvnet.voxel_index, (points, sample, 2, numbers))
+
+
+@pytest.mark.parametrize("scales", [[0.2, 0.4], [0.2, 0.3]])
+def test_compiles_into_one_graph(scales: list[float]) -> None:
+    """aot_eager needs no C++ compiler."""
+    grids = grids_of(scales)
+
+    def function(points: Tensor, sample: Tensor) -> tuple[Tensor, ...]:
+        cursor = voxel.cursors(points, sample, grids[0])
+        index = voxel.voxel_index(points, sample, 2, grids)
+        starts = [part.segments.starts for part in index.scales]
+        return cursor, *voxel.hash_index(cursor.clamp(min=0)), index.order, *starts
+
+    compiled = torch.compile(function, fullgraph=True, backend="aot_eager", dynamic=True)
+    for count in (500, 400):
+        arguments = cloud(count), torch.arange(count) % 2
+        for got, expected in zip(compiled(*arguments), function(*arguments), strict=True):
+            assert torch.equal(got, expected)
+    with pytest.raises(ValueError, match="sample"):
+        compiled(cloud(400), torch.full((400,), 2))
