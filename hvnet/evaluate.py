@@ -31,14 +31,14 @@ def _band(text: str) -> tuple[float, float]:
 
 
 def choose_classes(given: Sequence[str] | None, labels: Sequence[Labels], predictions: Sequence[Labels]) -> list[str]:
-    """The classes to score: those given, else KITTI's three, and every class that KITTI does not know.
-
-    Where no class is one of KITTI's, its three are left out. Raises InputError for a class that is nowhere.
+    """The classes to score: those given, else KITTI's three and every class that KITTI does not know, or, where there is
+    none of the three, every class there is. Raises InputError for a class that is nowhere.
     """
     found = Counter(name for frame in (*labels, *predictions) for name in frame.name.tolist())
     if given is None:
-        own = sorted(found.keys() - set(TYPES))
-        return [*(KITTI if found.keys() & set(TYPES) or not own else ()), *own]
+        if found.keys() & KITTI.keys() or not found.keys() - {DONTCARE}:
+            return [*KITTI, *sorted(found.keys() - set(TYPES))]
+        return sorted(found.keys() - {DONTCARE})
     missing = [name for name in given if name not in found and name not in KITTI]
     if missing:
         raise InputError(

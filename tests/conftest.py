@@ -7,8 +7,10 @@ import pytest
 import torch
 
 from hvnet.config import Config, config_to_dict, load_config
-from hvnet.data.synthetic import Options, generate
-from hvnet.model import HVNet, save_checkpoint
+from hvnet.data.scenes.files import generate
+from hvnet.data.scenes.street import Options
+from hvnet.network.checkpoint import save_checkpoint
+from hvnet.network.model import HVNet
 from tests.models import CONFIGS, NARROW
 
 torch.utils.deterministic.fill_uninitialized_memory = True

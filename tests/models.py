@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from hvnet.config import Config, config_to_dict, load_config
-from hvnet.model import HVNet, save_checkpoint
+from hvnet.network.checkpoint import save_checkpoint
+from hvnet.network.model import HVNet
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 NARROW = ["encoder.point_range=[0, -3.2, -3, 12.8, 3.2, 2]"]  # not square: 32 x 16 cells at demo's finest scale

@@ -56,7 +56,9 @@ def collect(data: Path, work: Path) -> dict[str, Any]:
     published, scores = data / "kitti_val_results", work / "scores.json"
     folders = ["--labels", published / "label_2", "--predictions", published / "point_gnn_car"]
     run("hvnet.evaluate", *folders, "--missing-as-empty", "--json", scores, "--classes", "Car")
-    numbers["AP of published results"] = json.loads(scores.read_text(encoding="utf-8"))
+    tables = json.loads(scores.read_text(encoding="utf-8"))
+    measures = ("R40", "R11", "exact", "loose", "counts", "report")
+    numbers["AP of published results"] = {name: {key: table[key] for key in measures} for name, table in tables.items()}
     return numbers
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hvnet import ranks
 from hvnet.config import Config, load_config
-from hvnet.model import HVNet
+from hvnet.network.model import HVNet
 
 ROOT = Path(__file__).resolve().parents[1]
 NARROW = ["encoder.point_range=[0, -3.2, -3, 12.8, 3.2, 2]"]
@@ -35,7 +35,7 @@ def one_step(batch: list[int]) -> tuple[dict[str, Tensor], dict[str, float]]:
     torch.manual_seed(0)
     torch.set_num_threads(1)
     model = HVNet(small()).train()
-    joint = ranks.parallel(model)
+    joint = ranks.wrap_ddp(model)
     points, boxes, labels = zip(*(cloud(b) for b in batch), strict=True)
     sample = torch.repeat_interleave(torch.arange(len(batch)), torch.tensor([len(p) for p in points]))
     terms = model.loss(joint(torch.cat(points), sample, len(batch)), list(boxes), list(labels))
@@ -46,7 +46,7 @@ def one_step(batch: list[int]) -> tuple[dict[str, Tensor], dict[str, float]]:
     }
     tensors |= {name: buffer for name, buffer in model.named_buffers() if "running" in name}
     assert all(tensor.isfinite().all() for tensor in tensors.values())
-    return tensors, {name: ranks.joined(term.detach()).item() for name, term in terms.items()}
+    return tensors, {name: ranks.all_reduce(term.detach()).item() for name, term in terms.items()}
 
 
 def worker(rank: int, out: str, rendezvous: str, batches: list[list[int]]) -> None:
@@ -72,9 +72,9 @@ def test_a_process_alone() -> None:
     assert ranks.start(torch.device("cpu")) == torch.device("cpu")
     assert (ranks.size(), ranks.rank()) == (1, 0)
     value = torch.ones(3)
-    assert ranks.joined(value) is value
-    assert ranks.of_first("this") == "this"
-    assert ranks.gathered("this") == ["this"]
+    assert ranks.all_reduce(value) is value
+    assert ranks.broadcast("this") == "this"
+    assert ranks.all_gather("this") == ["this"]
     features = torch.randn(2, 3, 4, 5)
     own, plain = ranks.BatchNorm2d(3), torch.nn.BatchNorm2d(3)
     assert torch.equal(own(features), plain(features))

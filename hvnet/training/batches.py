@@ -186,7 +186,7 @@ def check_frames(frames: Frames, skip: bool, say: Callable[..., None]) -> tuple[
 
     The first mistake raises InputError or, with `skip`, is named and its frame left out.
     """
-    good, names = [], Counter[str]()
+    good, names, last = [], Counter[str](), ""
     hidden = ranks.rank() > 0
     for k in tqdm(range(len(frames)), desc="checking", unit="frame", leave=False, dynamic_ncols=True, disable=hidden):
         try:
@@ -198,7 +198,8 @@ def check_frames(frames: Frames, skip: bool, say: Callable[..., None]) -> tuple[
         except (InputError, OSError) as error:
             if not skip:
                 raise
+            last = str(error)
             say(f"frame {frames.names[k]} is skipped: {error}")
     if not good:
-        raise InputError("no frame can be read")
+        raise InputError(f"no frame of the split can be read; the last: {last}")
     return good, names

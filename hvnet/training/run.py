@@ -84,6 +84,8 @@ class Run:
         self.say(
             f"{len(data.train)} frames to train, {len(data.val)} to validate, on {device}; the run is {out}", flush=True
         )
+        if self.background:
+            self.say(self.background)
         if ranks.rank() == 0:
             self.out.mkdir(parents=True, exist_ok=True)
             if not resume:
@@ -112,8 +114,7 @@ class Run:
         good, names = check_frames(data.train, config.train.skip_corrupt, self.say)
         names += check_frames(data.val, False, self.say)[1]
         classes = [entry.name for entry in config.head.classes]
-        if note := background_note(names, classes):
-            self.say(note)
+        self.background = background_note(names, classes)
         # worker processes know no GPU; without them the frames lie on it
         place = self.device if config.train.workers == 0 else torch.device("cpu")
         objects = None

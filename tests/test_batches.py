@@ -1,0 +1,104 @@
+"""Batches of augmented frames: what an item depends on, their order, what is dropped."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from hvnet.config import Config
+from hvnet.data.augment import objects_of
+from hvnet.data.gt_database import load_database
+from hvnet.data.kitti import KittiFrames
+from hvnet.training.batches import EpochOrder, TrainingFrames, collate, seeded
+
+CPU = torch.device("cpu")
+IDS = ["000000", "000001", "000002"]
+
+
+def test_an_item_depends_on_seed_epoch_and_number_alone(scenes: Path, tiny: Config) -> None:
+    objects = objects_of(load_database(scenes, IDS, []), CPU)
+
+    def frames(seed: int = 0) -> TrainingFrames:
+        config = dataclasses.replace(tiny, train=dataclasses.replace(tiny.train, seed=seed))
+        return TrainingFrames(KittiFrames(scenes, IDS), config, objects, CPU)
+
+    one = frames()
+    first = {item: one[item] for item in ((0, 0), (0, 1), (1, 0), (7, 2))}
+    torch.rand(3)  # no state of torch's matters
+    other = frames()
+    for item in reversed(first):  # nor does the order
+        assert same(other[item], first[item])
+        assert same(one[item], first[item])
+    assert not same(first[0, 0], first[1, 0])
+    assert not same(first[0, 0], frames(seed=1)[0, 0])
+
+
+def test_order_of_an_epoch() -> None:
+    order = EpochOrder(50, 4, seed=3)
+    first = list(order)
+    assert len(order) == len(first) == 12  # two frames do not fill a batch
+    items = [item for batch in first for item in batch]
+    assert all(len(batch) == 4 for batch in first)
+    assert len(set(items)) == 48
+    assert set(items) < {(0, k) for k in range(50)}
+    assert list(order) == first
+    order.begin = 5
+    assert list(order) == first[5:]
+    order.begin, order.epoch = 0, 1
+    assert {epoch for batch in order for epoch, _ in batch} == {1}
+    assert [k for batch in order for _, k in batch] != [k for _, k in items]
+    assert list(EpochOrder(50, 4, seed=4)) != first
+    assert [len(batch) for batch in EpochOrder(3, 4, seed=0)] == [3]  # unless there are no others
+
+
+def test_ranks_share_a_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = list(EpochOrder(8, 4, seed=0))
+    monkeypatch.setattr("hvnet.ranks.size", lambda: 2)
+    shares = []
+    for rank in range(2):
+        monkeypatch.setattr("hvnet.ranks.rank", lambda rank=rank: rank)
+        shares.append(list(EpochOrder(8, 4, seed=0)))
+    for batch, *parts in zip(whole, *shares, strict=True):
+        assert [len(part) for part in parts] == [2, 2]
+        assert sorted(parts[0] + parts[1]) == sorted(batch)
+
+
+def test_seeds_are_mixed() -> None:
+    seeds = {seeded(a, b, c).initial_seed() for a in range(8) for b in range(8) for c in range(8)}
+    assert len(seeds) == 512
+    assert seeded(1, 2).initial_seed() == seeded(1, 2).initial_seed()
+
+
+def test_boxes_outside_the_range_and_other_classes_are_dropped(copied: Path, tiny: Config) -> None:
+    still = dataclasses.replace(tiny.augment, flip=0, rotation=0, scaling=(1, 1), translation=(0, 0, 0), objects={})
+    config = dataclasses.replace(tiny, augment=still)
+    lines = [
+        "Car 0 0 0 600 150 700 200 1.5 1.6 4.0 0.00 1.7 10.0 0",  # ahead
+        "Car 0 0 0 600 150 700 200 1.5 1.6 4.0 0.00 1.7 40.0 0",  # too far
+        "Pedestrian 0 0 0 600 150 700 200 1.7 0.6 0.8 -7.5 1.7 9.0 0",  # too far to the left
+        "Cyclist 0 0 0 600 150 700 200 1.7 0.6 1.8 5.0 1.7 9.0 0",
+        "Van 0 0 0 600 150 700 200 2.0 1.9 5.0 -4.0 1.7 12.0 0",  # no class of the config
+        "DontCare -1 -1 -10 600 150 700 200 -1 -1 -1 -1000 -1000 -1000 -10",
+    ]
+    (copied / "training" / "label_2" / "000000.txt").write_text("\n".join(lines) + "\n")
+    _, boxes, labels, _, name = TrainingFrames(KittiFrames(copied, IDS[:1]), config, None, CPU)[0, 0]
+    assert name == "000000"
+    assert labels.tolist() == [0, 2]
+    # the camera stands 0.27 m before the LiDAR, and its axes are turned by less than a degree
+    torch.testing.assert_close(boxes[:, :2], torch.tensor([[10.3, 0.0], [9.3, -5.0]]), rtol=0, atol=0.2)
+
+
+def test_batches_hold_whole_frames(scenes: Path, tiny: Config) -> None:
+    items = [(0, 2), (0, 0), (0, 1)]
+    config = dataclasses.replace(tiny, augment=dataclasses.replace(tiny.augment, objects={}))
+    frames = TrainingFrames(KittiFrames(scenes, IDS), config, None, CPU)
+    (batch,) = DataLoader(frames, batch_size=3, sampler=items, collate_fn=collate)  # type: ignore[arg-type]
+    for b, item in enumerate(items):
+        points, boxes, labels, _, name = frames[item]
+        assert batch.names[b] == name
+        assert torch.equal(batch.points[batch.sample == b], points)
+        assert torch.equal(batch.boxes[b], boxes)
+        assert torch.equal(batch.labels[b], labels)
+    assert (batch.sample.diff() >= 0).all()
