@@ -7,6 +7,7 @@ import torch
 from shapely.geometry import Polygon
 
 from hvnet.boxes import bev_corners, box_corners, boxes_collide, limit_angle, points_in_boxes
+from tests.helpers import random_boxes
 
 ANGLES = [
     (0.0, 0.0),
@@ -18,15 +19,6 @@ ANGLES = [
     (-1.5 * math.pi, math.pi / 2),
     (7 * math.pi + 1, 1 - math.pi),
 ]
-
-
-def random_boxes(count: int, seed: int, spread: float) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    boxes = torch.rand(count, 7, generator=generator, dtype=torch.float64)
-    boxes[:, :3] = (boxes[:, :3] - 0.5) * spread
-    boxes[:, 3:6] = boxes[:, 3:6] * 5 + 0.1
-    boxes[:, 6] = (boxes[:, 6] - 0.5) * 2 * math.pi
-    return boxes
 
 
 @pytest.mark.parametrize(("angle", "wrapped"), ANGLES)
@@ -69,7 +61,7 @@ def test_points_in_boxes_counts_the_faces() -> None:
 
 def test_points_in_boxes_agrees_with_the_corners() -> None:
     """A point is inside iff it is a combination of the box's edges with shares between 0 and 1."""
-    boxes = random_boxes(20, seed=0, spread=4)
+    boxes = random_boxes(20, seed=0, spread=2)
     points = (torch.rand(500, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 0.5) * 8
     corners = box_corners(boxes)
     origin = corners[:, 2]
@@ -86,7 +78,7 @@ def test_points_in_boxes_of_nothing() -> None:
 
 
 def test_boxes_collide_as_polygons_overlap() -> None:
-    a, b = random_boxes(40, seed=2, spread=12), random_boxes(30, seed=3, spread=12)
+    a, b = random_boxes(40, seed=2, spread=6), random_boxes(30, seed=3, spread=6)
     polygons_a, polygons_b = ([Polygon(corners.tolist()) for corners in bev_corners(boxes)] for boxes in (a, b))
     expected = torch.tensor([[p.intersection(q).area > 1e-9 for q in polygons_b] for p in polygons_a])
     assert 0.1 < expected.double().mean() < 0.9

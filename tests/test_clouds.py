@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 from pypcd4 import Encoding, PointCloud
 
-from hvnet.cli import InputError
 from hvnet.data.clouds import read_cloud
+from hvnet.exceptions import InputError
 
 KINDS = ("bin", "npy", "npy64", "pcd-ascii", "pcd-binary", "pcd-binary_compressed", "ply-ascii", "ply-binary")
 

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 import yaml
 
-from hvnet.cli import InputError
 from hvnet.config import (
     AugmentConfig,
     BackboneConfig,
@@ -21,6 +20,7 @@ from hvnet.config import (
     config_to_dict,
     load_config,
 )
+from hvnet.exceptions import InputError
 from tests.models import CONFIGS
 
 SHIPPED = sorted(CONFIGS.glob("*.yaml"))
@@ -55,7 +55,7 @@ def test_shipped_configs_load_and_survive_the_round_trip(path: Path) -> None:
                 if key != "classes":
                     assert plain[group][key] == value, f"{group}.{key}"
     for entry, made in zip(given["head"]["classes"], plain["head"]["classes"], strict=True):
-        assert made == entry
+        assert made == {"overlap": None} | entry
 
 
 def test_the_demo_is_shipped() -> None:
@@ -157,6 +157,12 @@ def test_whole_numbers_are_numbers(tree: dict[str, Any]) -> None:
         ("head.classes.0.focal_alpha", 2, "head.classes[0].focal_alpha", "want between 0 and 1"),
         ("head.classes.0.focal_gamma", -1, "head.classes[0].focal_gamma", "want 0 or more"),
         ("head.classes.0.nms_iou", 1.5, "head.classes[0].nms_iou", "want between 0 and 1"),
+        ("head.classes.0.overlap", 0, "head.classes[0].overlap", "want above 0 and at most 1, got 0"),
+        ("head.classes.0.overlap", 1.1, "head.classes[0].overlap", "want above 0 and at most 1, got 1.1"),
+        ("head.classes.0.overlap", "half", "head.classes[0].overlap", r"want a number \(YAML"),
+        ("head.classes.0.name", "traffic cone", "head.classes[0].name", "want a word, as in the label files, but not"),
+        ("head.classes.0.name", "", "head.classes[0].name", "want a word"),
+        ("head.classes.0.name", "DontCare", "head.classes[0].name", "want a word, as in the label files, but not Dont"),
         ("head.score_threshold", 1, "head.score_threshold", "want at least 0 and below 1"),
         ("head.candidates", 0, "head.candidates", "want 1 or more"),
         ("head.detections", 0, "head.detections", "want 1 or more"),
@@ -179,6 +185,15 @@ def test_whole_numbers_are_numbers(tree: dict[str, Any]) -> None:
 def test_mistakes_are_refused(tree: dict[str, Any], key: str, value: Any, where: str, what: str) -> None:
     with pytest.raises(InputError, match=rf"^some/file\.yaml: {re.escape(where)}: {what}"):
         config_from_dict(changed(tree, key, value), "some/file.yaml")
+
+
+def test_any_word_is_a_class(tree: dict[str, Any]) -> None:
+    named = changed(changed(tree, "head.classes.0.name", "truck2"), "head.classes.0.overlap", 0.4)
+    config = config_from_dict(changed(named, "augment.objects", {"truck2": 3}), "file")
+    assert (config.head.classes[0].name, config.head.classes[0].overlap) == ("truck2", 0.4)
+    assert [entry.overlap for entry in config.head.classes[1:]] == [None, None]  # by size
+    with pytest.raises(InputError, match=r"^file: augment\.objects\.Car: want a class of head\.classes \(truck2, Pede"):
+        config_from_dict(named, "file")
 
 
 def test_a_missing_key_is_named(tree: dict[str, Any]) -> None:
@@ -284,8 +299,8 @@ def test_a_file_is_laid_over_its_base(tmp_path: Path, tree: dict[str, Any]) -> N
     assert config.augment.objects == {"Car": 15, "Pedestrian": 8}
     other = dict(tree, train={"epochs": 1, "weight_decay": 0.25})
     write(tmp_path, other=yaml.safe_dump(other))
-    instead = (tmp_path / "bottom.yaml", tmp_path / "other.yaml")
-    rebased = load_config(tmp_path / "top.yaml", ["head.classes.Car.level=2"], instead)
+    replacement = (tmp_path / "bottom.yaml", tmp_path / "other.yaml")
+    rebased = load_config(tmp_path / "top.yaml", ["head.classes.Car.level=2"], replacement)
     assert (rebased.train.epochs, rebased.train.weight_decay) == (5, 0.25)  # the middle stays, the bottom is another
     assert rebased.head.classes[0].level == 2
 
