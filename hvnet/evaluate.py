@@ -31,19 +31,20 @@ def _band(text: str) -> tuple[float, float]:
 
 
 def choose_classes(given: Sequence[str] | None, labels: Sequence[Labels], predictions: Sequence[Labels]) -> list[str]:
-    """The classes to score: those given, else KITTI's three and every class that KITTI does not know, or, where there is
-    none of the three, every class there is. Raises InputError for a class that is nowhere.
+    """The classes to score: those given, else KITTI's three and every class that KITTI does not know.
+
+    Where there is none of the three it is every class there is. Raises InputError for a class that is nowhere.
     """
     found = Counter(name for frame in (*labels, *predictions) for name in frame.name.tolist())
     if given is None:
         if found.keys() & KITTI.keys() or not found.keys() - {DONTCARE}:
             return [*KITTI, *sorted(found.keys() - set(TYPES))]
         return sorted(found.keys() - {DONTCARE})
-    missing = [name for name in given if name not in found and name not in KITTI]
+    known = found.keys() - {DONTCARE}
+    missing = [name for name in given if name not in known and name not in KITTI]
     if missing:
-        raise InputError(
-            f"--classes {missing[0]}: no label or result is of this class; there are {', '.join(sorted(found))}"
-        )
+        there = f"there are {', '.join(sorted(known))}" if known else "there are none"
+        raise InputError(f"--classes {missing[0]}: no label or result is of this class; {there}")
     return list(given)
 
 
@@ -126,12 +127,12 @@ def main(argv: Sequence[str] | None) -> None:
         points=points,
     )
     print(format_table(result))
-    for what, rows in (("labels", labels), ("results", predictions)):
-        if others := unscored(rows, classes):
-            print(textwrap.fill(f"{what} of classes that are not scored: {others}", 100))
     without = sum(not (args.predictions / f"{frame}.txt").is_file() for frame in frames)
     empty = f", {without} of them without a result file, counted as empty" if without else ""
     print(f"\n{len(frames)} frame{'s' * (len(frames) != 1)} scored{empty}")
+    for what, rows in (("labels", labels), ("results", predictions)):
+        if others := unscored(rows, classes):
+            print(textwrap.fill(f"{what} of classes that are not scored: {others}", 100))
     figures = {name: {key: scored[key] for key in scored if key != "curves"} for name, scored in result.items()}
     try:
         if args.json:

@@ -1,6 +1,7 @@
 """Fixtures for all tests: unwritten memory is seen, the real KITTI frames are found or skipped."""
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from hvnet.data.scenes.files import generate
 from hvnet.data.scenes.street import Options
 from hvnet.network.checkpoint import save_checkpoint
 from hvnet.network.model import HVNet
-from tests.models import CONFIGS, NARROW
+from tests.models import CONFIGS, NARROW, SHORT
 
 torch.utils.deterministic.fill_uninitialized_memory = True
 torch.use_deterministic_algorithms(True)  # with it, torch.empty is filled with NaN or the largest integer
@@ -41,6 +42,18 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("scenes") / "kitti"
     generate(root, 4, 2, seed=0, options=Options(azimuth=41, distance=(4.0, 22.0)))
     return root
+
+
+@pytest.fixture
+def copied(scenes: Path, tmp_path: Path) -> Path:
+    """Scenes that a test may change."""
+    return Path(shutil.copytree(scenes, tmp_path / "kitti"))
+
+
+@pytest.fixture
+def tiny() -> Config:
+    """The config of a run of seconds."""
+    return load_config(CONFIGS / "demo.yaml", SHORT)
 
 
 @pytest.fixture(scope="session")

@@ -21,6 +21,19 @@ TINY = [
     "backbone.layers=[2, 2, 2]",
     "backbone.fusion_channels=8",
 ]
+SHORT = [
+    *TINY,
+    "head.score_threshold=0.001",
+    "head.candidates=50",
+    "head.detections=5",
+    "train.epochs=2",
+    "train.batch_size=2",
+    "train.warmup_steps=3",
+    "train.decay_epochs=[1]",
+    "train.validate_every=1",
+    "train.pictures=1",
+]
+"""A run of seconds, of the demo's config."""
 
 
 def save_untrained(path: Path, changes: Sequence[str], seed: int = 0) -> None:

@@ -12,6 +12,7 @@ from hvnet.data.augment import objects_of
 from hvnet.data.gt_database import load_database
 from hvnet.data.kitti import KittiFrames
 from hvnet.training.batches import EpochOrder, TrainingFrames, collate, seeded
+from tests.helpers import same
 
 CPU = torch.device("cpu")
 IDS = ["000000", "000001", "000002"]

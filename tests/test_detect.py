@@ -19,25 +19,24 @@ from pypcd4 import Encoding, PointCloud
 
 from hvnet import evaluate
 from hvnet.boxes import limit_angle
-from hvnet.cli import InputError
 from hvnet.config import config_to_dict
+from hvnet.data.frame import Camera, Frame
 from hvnet.data.kitti import (
-    AT_LIDAR,
-    NO_IMAGE,
-    Calibration,
     boxes_to_lidar,
-    project_boxes,
+    detections_to_labels,
     read_calibration,
     read_labels,
     read_points,
     write_labels,
 )
-from hvnet.detect import Cloud, check_results, csv_rows, main, result_rows, submission_rows
-from hvnet.detector import load
-from hvnet.model import Detections, load_checkpoint, save_checkpoint
+from hvnet.data.labels import Labels
+from hvnet.detect import check_results, csv_rows, main, result_rows, submission_rows
+from hvnet.exceptions import InputError
+from hvnet.network.checkpoint import load_checkpoint, save_checkpoint
+from hvnet.network.detector import load
+from hvnet.network.model import Detections
+from tests.helpers import ROOT, contents
 from tests.models import TINY, save_untrained
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -71,17 +70,19 @@ def boxes_of(rows: list[dict[str, str]]) -> NDArray[np.float64]:
     return np.array([[float(row[key]) for key in keys] for row in rows]).reshape(-1, 7)
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+def rows_of(found: Detections, camera: Camera | None, classes: tuple[str, ...]) -> Labels:
+    """What a result file holds of detections."""
+    rows = detections_to_labels(found.boxes, found.scores, found.names(classes), camera)
+    return result_rows(rows, Frame("000000", torch.zeros(0, 4), camera=camera))
 
 
-def assert_agrees(out: Path, name: str, rows: list[dict[str, str]], calib: Calibration) -> None:
+def assert_agrees(out: Path, name: str, rows: list[dict[str, str]], camera: Camera | None) -> None:
     """The result file NAME.txt says what rows of boxes.csv say, once taken to LiDAR axes."""
     labels = read_labels(out / "results" / f"{name}.txt", scored=True)
     assert labels.score is not None
     assert labels.name.tolist() == [row["class"] for row in rows]
     np.testing.assert_allclose(labels.score, [float(row["score"]) for row in rows], rtol=0, atol=6e-5)  # 4 digits
-    difference = boxes_to_lidar(labels, calib) - boxes_of(rows)
+    difference = boxes_to_lidar(labels, camera) - boxes_of(rows)
     difference[:, 6] = limit_angle(torch.from_numpy(difference[:, 6])).numpy()
     # half of the last digit of the table, 1 mm, and of the file, 0.1 mm, whose axes are turned
     assert np.abs(difference).max(initial=0) < 0.5e-3 + 1e-4
@@ -142,7 +143,7 @@ def test_results_without_calibration(checkpoint: Path, cloud: NDArray[np.float32
     assert (labels.truncation == -1).all()
     assert (labels.occlusion == -1).all()
     assert (np.abs(labels.alpha) <= 3.1416).all()
-    assert_agrees(tmp_path / "out", "cloud", table(tmp_path / "out"), AT_LIDAR)
+    assert_agrees(tmp_path / "out", "cloud", table(tmp_path / "out"), None)
     assert not (tmp_path / "out" / "pictures").exists()
 
 
@@ -164,7 +165,7 @@ def test_odd_clouds(checkpoint: Path, tmp_path: Path, points: NDArray) -> None:
     np.save(tmp_path / "cloud.npy", points)
     detect(checkpoint, tmp_path / "out", tmp_path / "cloud.npy")
     assert (tmp_path / "out" / "pictures" / "cloud.png").is_file()
-    assert_agrees(tmp_path / "out", "cloud", table(tmp_path / "out"), AT_LIDAR)
+    assert_agrees(tmp_path / "out", "cloud", table(tmp_path / "out"), None)
 
 
 def test_no_detections(checkpoint: Path, cloud: NDArray[np.float32], tmp_path: Path) -> None:
@@ -191,10 +192,10 @@ def test_kitti_root(checkpoint: Path, scenes: Path, tmp_path: Path) -> None:
     rows = table(tmp_path / "all")
     for name in names:
         own = [row for row in rows if row["cloud"] == name]
-        calib = read_calibration(scenes / "training" / "calib" / f"{name}.txt")
-        bbox, visible = project_boxes(boxes_of(own), calib, (1242, 375))
+        camera = read_calibration(scenes / "training" / "calib" / f"{name}.txt")
+        bbox, visible = camera.project_boxes(boxes_of(own))
         seen = [row for row, is_seen in zip(own, visible, strict=True) if is_seen]
-        assert_agrees(tmp_path / "all", name, seen, calib)
+        assert_agrees(tmp_path / "all", name, seen, camera)
         labels = read_labels(tmp_path / "all" / "results" / f"{name}.txt", scored=True)
         large = (bbox[visible, 2:] - bbox[visible, :2] < 400).all(axis=1)  # next to the camera 1 mm is many pixels
         np.testing.assert_allclose(labels.bbox[large], bbox[visible][large], rtol=0, atol=1.0)
@@ -228,15 +229,14 @@ def test_a_frame_with_an_image_has_it_in_its_picture(checkpoint: Path, scenes: P
 
 
 def test_boxes_outside_the_image_are_in_the_table_alone(scenes: Path) -> None:
-    calib = read_calibration(scenes / "training" / "calib" / "000000.txt")
+    camera = read_calibration(scenes / "training" / "calib" / "000000.txt")
     size = [4.0, 1.7, 1.5, 0.0]
     boxes = torch.tensor([[10.0, 0.0, -1.0, *size], [-10.0, 0.0, -1.0, *size], [5.0, 12.0, -1.0, *size]])
     found = Detections(boxes, torch.tensor([0.9, 0.8, 0.7]), torch.tensor([1, 0, 0]))
-    cloud = Cloud(torch.zeros(0, 4), torch.zeros(0, 7), calib, (1242, 375), [])
-    rows = result_rows(found, cloud, ("Car", "Van"))
+    rows = rows_of(found, camera, ("Car", "Van"))
     assert rows.name.tolist() == ["Van"]
     assert rows.score == pytest.approx([0.9])
-    assert len(result_rows(found, cloud._replace(calib=AT_LIDAR, image_size=NO_IMAGE), ("Car", "Van"))) == 3
+    assert len(rows_of(found, None, ("Car", "Van"))) == 3
     assert [row[:3] for row in csv_rows("a", found, ("Car", "Van"))] == [
         ["a", "Van", "0.9000"],
         ["a", "Car", "0.8000"],
@@ -361,11 +361,10 @@ def test_a_frame_that_the_server_does_not_know(
 
 def test_submission_of_a_class_that_is_not_scored(scenes: Path, tmp_path: Path) -> None:
     """A van is left out, and angles that would be rounded to more than pi are not."""
-    calib = read_calibration(scenes / "training" / "calib" / "000000.txt")
+    camera = read_calibration(scenes / "training" / "calib" / "000000.txt")
     boxes = torch.tensor([[10.0, 0, -1, 4, 1.7, 1.5, np.pi / 2], [15, 0, -1, 4, 1.7, 1.5, 0]])
-    cloud = Cloud(torch.zeros(0, 4), torch.zeros(0, 7), calib, (1242, 375), [])
     found = Detections(boxes, torch.tensor([0.9, 0.8]), torch.tensor([0, 1]))
-    rows = result_rows(found, cloud, ("Car", "Van"))
+    rows = rows_of(found, camera, ("Car", "Van"))
     assert rows.name.tolist() == ["Car", "Van"]
     write_labels(tmp_path / "000000.txt", rows)
     with pytest.raises(InputError, match=r"000000\.txt:2: a class that is not scored"):
@@ -380,7 +379,7 @@ def test_submission_of_a_class_that_is_not_scored(scenes: Path, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        (0, "Bus", "unknown class 'Bus'"),
+        (0, "Bus", "a class that is not scored"),
         (0, "DontCare", "a class that is not scored"),
         (4, "nan", "not a finite number"),
         (15, "inf", "not a finite number"),
@@ -408,18 +407,17 @@ def test_results_that_the_server_would_reject(tmp_path: Path, field: int, value:
 
 def test_box_with_a_sliver_in_the_image_is_not_reported(scenes: Path) -> None:
     """Its 2D box is 0.004 pixels wide, which four digits would make a line or nothing."""
-    calib = read_calibration(scenes / "training" / "calib" / "000000.txt")
+    camera = read_calibration(scenes / "training" / "calib" / "000000.txt")
     box = np.array([[12.0, 9.0, -1, 4, 1.7, 1.5, 0]])
     low, high = 5.0, 30.0  # metres to the left, partly in the image and outside
     for _ in range(60):
         box[0, 1] = (low + high) / 2
-        bbox, visible = project_boxes(box, calib, (1242, 375))
+        bbox, visible = camera.project_boxes(box)
         low, high = (box[0, 1], high) if visible[0] and bbox[0, 2] > 0.004 else (low, box[0, 1])
     box[0, 1] = low
-    assert 0 < project_boxes(box, calib, (1242, 375))[0][0, 2] < 0.01
+    assert 0 < camera.project_boxes(box)[0][0, 2] < 0.01
     found = Detections(torch.from_numpy(box), torch.tensor([0.9]), torch.tensor([0]))
-    cloud = Cloud(torch.zeros(0, 4), torch.zeros(0, 7), calib, (1242, 375), [])
-    assert len(result_rows(found, cloud, ("Car",))) == 0
+    assert len(rows_of(found, camera, ("Car",))) == 0
 
 
 # --- mistakes ---------------------------------------------------------------------------------------------------------

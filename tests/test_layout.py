@@ -1,4 +1,4 @@
-"""The tree is as docs/architecture.md says: imports point down, and a kernel's stem goes through kernel, twin and test."""
+"""The tree is as docs/architecture.md says: imports point down; a kernel's stem goes through kernel, twin and test."""
 
 import ast
 import subprocess
@@ -134,7 +134,8 @@ def test_symlink(name: str) -> None:
 
 
 def test_import_prints_nothing() -> None:
-    code = "import hvnet, hvnet.network.detector, torch, hvnet.kernels.rotated as r; r.rotated_iou_bev(*[torch.ones(1, 7)] * 2)"
+    code = "import hvnet, hvnet.network.detector, torch, hvnet.kernels.rotated as r\n"
+    code += "r.rotated_iou_bev(*[torch.ones(1, 7)] * 2)"
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
     )

@@ -30,22 +30,10 @@ from hvnet.train import choose_out, main
 from hvnet.training import run as run_module
 from hvnet.training.batches import collate
 from hvnet.training.run import Run, learning_rate
-from tests.helpers import ROOT, contents
-from tests.models import TINY
+from tests.helpers import ROOT, contents, same
+from tests.models import SHORT
 
 DEMO = ROOT / "configs" / "demo.yaml"
-SHORT = [
-    *TINY,
-    "head.score_threshold=0.001",
-    "head.candidates=50",
-    "head.detections=5",
-    "train.epochs=2",
-    "train.batch_size=2",
-    "train.warmup_steps=3",
-    "train.decay_epochs=[1]",
-    "train.validate_every=1",
-    "train.pictures=1",
-]
 
 
 def run(root: Path | None, out: Path, *changes: str, resume: bool = False, config: Path = DEMO) -> str:
@@ -63,15 +51,6 @@ def metrics(out: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
 
 
-def same(a: Any, b: Any) -> bool:
-    """Whether two checkpoints are equal, tensors bit for bit."""
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
-    if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
-    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
-
-
 def numbers(printed: str) -> str:
     """What was printed, without the paths and what is said of the labels."""
     lines = printed.splitlines()
@@ -87,12 +66,6 @@ def trained(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     printed = run(scenes, out)
     torch.set_num_threads(threads)
     return out, printed
-
-
-@pytest.fixture
-def copied(scenes: Path, tmp_path: Path) -> Path:
-    """Scenes that a test may change."""
-    return Path(shutil.copytree(scenes, tmp_path / "kitti"))
 
 
 # --- a run ------------------------------------------------------------------------------------------------------------
