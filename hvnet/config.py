@@ -2,14 +2,15 @@
 are refused with the dotted key. Defaults are the paper's (Sec. 4.1), see configs/hvnet.yaml."""
 
 import dataclasses
+import itertools
 import math
 import sys
 import types
 import typing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import yaml
 
@@ -318,105 +319,116 @@ def _build(kind: Any, value: Any, key: str, source: str) -> Any:
     return value
 
 
+class Check(NamedTuple):
+    """A condition that single values have to meet."""
+
+    group: str  # of the keys; "head.classes" for those of every class
+    keys: str
+    wanted: str
+    holds: Callable[[Any], bool]
+
+
+CHECKS = (
+    Check("encoder", "voxel_size", "sizes above 0", lambda v: min(v) > 0),
+    Check("encoder", "feature_scales projection_scales", "scales above 0", lambda v: min(v, default=0) > 0),
+    Check("encoder", "feature_scales projection_scales", "no scale twice", lambda v: len(set(v)) == len(v)),
+    Check("encoder", "feature_channels image_channels", f"1 to {MAX_CHANNELS}", lambda v: 0 < v <= MAX_CHANNELS),
+    Check("encoder", "point_limit voxel_limit", "0 (none) or more", lambda v: v >= 0),
+    Check("backbone", "stride", "1 or 2", lambda v: v in (1, 2)),
+    Check("backbone", "fusion_channels", f"1 to {MAX_CHANNELS}", lambda v: 0 < v <= MAX_CHANNELS),
+    Check("head", "classes", "at least one class", lambda v: len(v) > 0),
+    Check("head", "score_threshold", "at least 0 and below 1", lambda v: 0 <= v < 1),
+    Check("head", "candidates detections", "1 or more", lambda v: v > 0),
+    Check(
+        "head.classes",
+        "name",
+        "a word, as in the label files, but not DontCare",
+        lambda v: v.split() == [v] and v != "DontCare",
+    ),
+    Check("head.classes", "anchor_sizes", "at least one size", lambda v: len(v) > 0),
+    Check("head.classes", "anchor_sizes", "sizes above 0", lambda v: min(map(min, v)) > 0),
+    Check("head.classes", "positive_iou", "above 0 and at most 1", lambda v: 0 < v <= 1),
+    Check("head.classes", "overlap", "above 0 and at most 1", lambda v: v is None or 0 < v <= 1),
+    Check("head.classes", "focal_alpha nms_iou", "between 0 and 1", lambda v: 0 <= v <= 1),
+    Check("head.classes", "focal_gamma", "0 or more", lambda v: v >= 0),
+    Check("loss", "localization classification vertical direction iou", "0 or more", lambda v: v >= 0),
+    Check("loss", "beta", "above 0", lambda v: v > 0),
+    Check("augment", "flip whole_frames mix", "between 0 and 1", lambda v: 0 <= v <= 1),
+    Check("augment", "rotation", "0 or more", lambda v: v >= 0),
+    Check("augment", "scaling", "0 < low <= high", lambda v: 0 < v[0] <= v[1]),
+    Check("augment", "translation", "0 or more", lambda v: min(v) >= 0),
+    Check("train", "epochs repeat batch_size validate_every", "1 or more", lambda v: v > 0),
+    Check("train", "warmup_steps pictures workers weight_decay seed", "0 or more", lambda v: v >= 0),
+    Check("train", "learning_rate warmup_ratio decay_ratio gradient_clip", "above 0", lambda v: v > 0),
+    Check("train", "seed", "below 2**63", lambda v: v < 2**63),
+    Check("train", "decay_epochs", "epochs above 0", lambda v: min(v, default=1) > 0),
+    Check("synthetic", "train_frames val_frames", "1 or more", lambda v: v > 0),
+)
+
+
 def _check(config: Config, source: str) -> None:
-    """Rejects invalid values."""
+    """Rejects invalid values: the table first, then what values have to be to each other."""
 
     def want(holds: bool, key: str, wanted: str, got: object) -> None:
         if not holds:
+            got = list(got) if isinstance(got, tuple) else got
             raise InputError(f"{source}: {key}: want {wanted}, got {got}")
 
-    encoder, backbone, head, train = config.encoder, config.backbone, config.head, config.train
+    for check in CHECKS:
+        groups = {check.group: getattr(config, check.group, None)}
+        if check.group == "head.classes":
+            groups = {f"head.classes[{k}]": entry for k, entry in enumerate(config.head.classes)}
+        for where, group in groups.items():
+            for key in check.keys.split() if group is not None else ():
+                value = getattr(group, key)
+                want(check.holds(value), f"{where}.{key}", check.wanted, value)
+    _check_encoder(config.encoder, want)
+    _check_backbone(config, want)
+    names = [entry.name for entry in config.head.classes]
+    want(len(set(names)) == len(names), "head.classes", "no class twice", names)
+    levels = 1 if config.backbone.pyramid == "upsampled" else 3
+    for k, entry in enumerate(config.head.classes):
+        key = f"head.classes[{k}]"
+        want(0 <= entry.level < levels, f"{key}.level", "0, 1 or 2" if levels == 3 else "0, the only one", entry.level)
+        want(0 <= entry.negative_iou <= entry.positive_iou, f"{key}.negative_iou",
+             "between 0 and positive_iou", entry.negative_iou)  # fmt: skip
+    for name, count in config.augment.objects.items():
+        want(name in names, f"augment.objects.{name}", f"a class of head.classes ({', '.join(names)})", name)
+        want(count >= 0, f"augment.objects.{name}", "0 or more", count)
+
+
+def _check_encoder(encoder: EncoderConfig, want: Callable[[bool, str, str, object], None]) -> None:
     low, high = encoder.point_range[:3], encoder.point_range[3:]
     want(all(a < b for a, b in zip(low, high, strict=True)), "encoder.point_range",
-         "x_min, y_min, z_min below x_max, y_max, z_max", list(encoder.point_range))  # fmt: skip
-    want(min(encoder.voxel_size) > 0, "encoder.voxel_size", "sizes above 0", list(encoder.voxel_size))
-    for key in ("feature_scales", "projection_scales"):
-        scales = getattr(encoder, key)
-        want(len(scales) > 0 and min(scales, default=0) > 0, f"encoder.{key}", "scales above 0", list(scales))
-        want(len(set(scales)) == len(scales), f"encoder.{key}", "no scale twice", list(scales))
-    for r, (fine, coarse) in enumerate(zip(encoder.projection_scales, encoder.projection_scales[1:], strict=False)):
+         "x_min, y_min, z_min below x_max, y_max, z_max", encoder.point_range)  # fmt: skip
+    for r, (fine, coarse) in enumerate(itertools.pairwise(encoder.projection_scales)):
         want(coarse == 2 * fine, f"encoder.projection_scales[{r + 1}]", f"twice the scale before, {2 * fine}", coarse)
-    for key in ("feature_channels", "image_channels"):
-        want(0 < getattr(encoder, key) <= MAX_CHANNELS, f"encoder.{key}", f"1 to {MAX_CHANNELS}", getattr(encoder, key))
     finest = [v * encoder.projection_scales[0] for v in encoder.voxel_size]
     cells = math.prod((b - a) / v for a, b, v in zip(low, high, finest, strict=False))
-    want(
-        cells <= MAX_CELLS,
-        "encoder.voxel_size",
-        f"at most {MAX_CELLS} cells in the finest projection",
-        f"{cells:.3g}",
-    )
-    for key in ("point_limit", "voxel_limit"):
-        want(getattr(encoder, key) >= 0, f"encoder.{key}", "0 (none) or more", getattr(encoder, key))
-    want(encoder.voxel_limit == 0 or encoder.point_limit > 0, "encoder.voxel_limit", "a point_limit beside it", "none")
+    wanted = f"at most {MAX_CELLS} cells in the finest projection"
+    want(cells <= MAX_CELLS, "encoder.voxel_size", wanted, f"{cells:.3g}")
+    wanted = "a point_limit beside it"
+    want(encoder.voxel_limit == 0 or encoder.point_limit > 0, "encoder.voxel_limit", wanted, "none")
     if encoder.vfe == "pillar":
         for key in ("feature_scales", "projection_scales"):
             scales = getattr(encoder, key)
-            want(scales == (1.0,), f"encoder.{key}", "[1.0] for pillars", list(scales))
+            want(scales == (1.0,), f"encoder.{key}", "[1.0] for pillars", scales)
         for key in ("point_limit", "voxel_limit"):
             want(getattr(encoder, key) > 0, f"encoder.{key}", "1 or more for pillars", getattr(encoder, key))
         padded = encoder.point_limit * encoder.voxel_limit
         want(padded <= MAX_CELLS, "encoder.voxel_limit", f"at most {MAX_CELLS} places of points in pillars", padded)
-    blocks = max(3, len(encoder.projection_scales))
-    want(backbone.stride in (1, 2), "backbone.stride", "1 or 2", backbone.stride)
-    want(backbone.stride == 1 or len(encoder.projection_scales) == 1, "backbone.stride",
-         "1 where a second image joins", backbone.stride)  # fmt: skip
+
+
+def _check_backbone(config: Config, want: Callable[[bool, str, str, object], None]) -> None:
+    backbone, images = config.backbone, len(config.encoder.projection_scales)
+    want(backbone.stride == 1 or images == 1, "backbone.stride", "1 where a second image joins", backbone.stride)
+    blocks = max(3, images)
+    wanted = "3 values" if blocks == 3 else f"3 to {blocks} values"
     for key in ("widths", "layers"):
         values = getattr(backbone, key)
-        wanted = "3 values" if blocks == 3 else f"3 to {blocks} values"
-        want(3 <= len(values) <= blocks, f"backbone.{key}", f"{wanted}, one a block", list(values))
-    in_reach = min(backbone.widths) > 0 and max(backbone.widths) <= MAX_CHANNELS
-    want(in_reach, "backbone.widths", f"values from 1 to {MAX_CHANNELS}", list(backbone.widths))
-    want(max(backbone.layers) <= MAX_LAYERS, "backbone.layers", f"{MAX_LAYERS} or fewer", list(backbone.layers))
-    want(
-        min(backbone.layers) > 1, "backbone.layers", "2 or more (an image joins after the first)", list(backbone.layers)
-    )
-    fusion = backbone.fusion_channels
-    want(0 < fusion <= MAX_CHANNELS, "backbone.fusion_channels", f"1 to {MAX_CHANNELS}", fusion)
-    want(len(head.classes) > 0, "head.classes", "at least one class", [])
-    names = [entry.name for entry in head.classes]
-    want(len(set(names)) == len(names), "head.classes", "no class twice", names)
-    for k, entry in enumerate(head.classes):
-        key = f"head.classes[{k}]"
-        levels = 1 if backbone.pyramid == "upsampled" else 3
-        want(0 <= entry.level < levels, f"{key}.level", "0, 1 or 2" if levels == 3 else "0, the only one", entry.level)
-        want(len(entry.anchor_sizes) > 0, f"{key}.anchor_sizes", "at least one size", [])
-        for size in entry.anchor_sizes:
-            want(min(size) > 0, f"{key}.anchor_sizes", "sizes above 0", list(size))
-        want(0 < entry.positive_iou <= 1, f"{key}.positive_iou", "above 0 and at most 1", entry.positive_iou)
-        want(0 <= entry.negative_iou <= entry.positive_iou, f"{key}.negative_iou",
-             "between 0 and positive_iou", entry.negative_iou)  # fmt: skip
-        want(0 <= entry.focal_alpha <= 1, f"{key}.focal_alpha", "between 0 and 1", entry.focal_alpha)
-        want(entry.focal_gamma >= 0, f"{key}.focal_gamma", "0 or more", entry.focal_gamma)
-        want(0 <= entry.nms_iou <= 1, f"{key}.nms_iou", "between 0 and 1", entry.nms_iou)
-        named = entry.name.split() == [entry.name] and entry.name != "DontCare"
-        want(named, f"{key}.name", "a word, as in the label files, but not DontCare", repr(entry.name))
-        in_reach = entry.overlap is None or 0 < entry.overlap <= 1
-        want(in_reach, f"{key}.overlap", "above 0 and at most 1", entry.overlap)
-    want(0 <= head.score_threshold < 1, "head.score_threshold", "at least 0 and below 1", head.score_threshold)
-    for key in ("candidates", "detections"):
-        want(getattr(head, key) > 0, f"head.{key}", "1 or more", getattr(head, key))
-    for weight in ("localization", "classification", "vertical", "direction", "iou"):
-        want(getattr(config.loss, weight) >= 0, f"loss.{weight}", "0 or more", getattr(config.loss, weight))
-    want(config.loss.beta > 0, "loss.beta", "above 0", config.loss.beta)
-    augment = config.augment
-    want(0 <= augment.flip <= 1, "augment.flip", "between 0 and 1", augment.flip)
-    want(augment.rotation >= 0, "augment.rotation", "0 or more", augment.rotation)
-    want(0 < augment.scaling[0] <= augment.scaling[1], "augment.scaling", "0 < low <= high", list(augment.scaling))
-    want(min(augment.translation) >= 0, "augment.translation", "0 or more", list(augment.translation))
-    for key in ("whole_frames", "mix"):
-        want(0 <= getattr(augment, key) <= 1, f"augment.{key}", "between 0 and 1", getattr(augment, key))
-    for name, count in augment.objects.items():
-        want(name in names, f"augment.objects.{name}", f"a class of head.classes ({', '.join(names)})", name)
-        want(count >= 0, f"augment.objects.{name}", "0 or more", count)
-    for key in ("epochs", "repeat", "batch_size", "validate_every"):
-        want(getattr(train, key) > 0, f"train.{key}", "1 or more", getattr(train, key))
-    for key in ("warmup_steps", "pictures", "workers", "weight_decay", "seed"):
-        want(getattr(train, key) >= 0, f"train.{key}", "0 or more", getattr(train, key))
-    for key in ("learning_rate", "warmup_ratio", "decay_ratio", "gradient_clip"):
-        want(getattr(train, key) > 0, f"train.{key}", "above 0", getattr(train, key))
-    want(train.seed < 2**63, "train.seed", "below 2**63", train.seed)
-    want(min(train.decay_epochs, default=1) > 0, "train.decay_epochs", "epochs above 0", list(train.decay_epochs))
-    if config.synthetic is not None:
-        for key in ("train_frames", "val_frames"):
-            want(getattr(config.synthetic, key) > 0, f"synthetic.{key}", "1 or more", getattr(config.synthetic, key))
+        want(3 <= len(values) <= blocks, f"backbone.{key}", f"{wanted}, one a block", values)
+    widths, layers = backbone.widths, backbone.layers
+    in_reach = min(widths) > 0 and max(widths) <= MAX_CHANNELS
+    want(in_reach, "backbone.widths", f"values from 1 to {MAX_CHANNELS}", widths)
+    want(max(layers) <= MAX_LAYERS, "backbone.layers", f"{MAX_LAYERS} or fewer", layers)
+    want(min(layers) > 1, "backbone.layers", "2 or more (an image joins after the first)", layers)
