@@ -22,6 +22,8 @@ Floats = NDArray[np.float64]
 
 IMAGE_SIZE = (1242, 375)
 """Width and height in pixels that a camera without an image is taken to have: most KITTI frames have them."""
+IMAGE_ERRORS = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+"""What Pillow raises for files that are no images, or damaged ones."""
 NEAR = 0.1
 """Metres in front of the camera from where on boxes and lines are projected."""
 
@@ -46,7 +48,7 @@ class Camera:
         try:
             with Image.open(self.image) as image:
                 return np.asarray(image.convert("RGB"))
-        except OSError as error:
+        except IMAGE_ERRORS as error:
             raise InputError(f"{self.image}: not an image, or cut off; replace or remove it") from error
 
     def _lidar_to_rectified(self) -> tuple[Floats, Floats]:
@@ -151,18 +153,22 @@ class Camera:
 
 @dataclass(frozen=True)
 class Objects:
-    """What is labelled in a frame: M objects."""
+    """What is labelled in a frame: M objects. Arrays are taken for tensors."""
 
     boxes: Tensor  # (M, 7) float32 x, y, z of the centre, length, width, height, yaw
     names: Sequence[str]  # M classes, whatever the labels call them
     labels: Labels | None = None  # the rows of a KITTI label file (K >= M) that they come from, regions as well
 
     def __post_init__(self) -> None:
-        boxes = torch.as_tensor(self.boxes, dtype=torch.float32).reshape(-1, 7)
+        boxes = torch.as_tensor(self.boxes, dtype=torch.float32)
+        if not boxes.numel():
+            boxes = boxes.new_zeros(0, 7)  # whatever the shape of nothing
+        if boxes.ndim != 2 or boxes.shape[1] != 7:
+            raise ValueError(f"boxes: want shape (M, 7) with x, y, z, l, w, h, yaw, got {tuple(boxes.shape)}")
         if len(boxes) != len(self.names):
             raise ValueError(f"names: want one for each of the {len(boxes)} boxes, got {len(self.names)}")
         object.__setattr__(self, "boxes", boxes)
-        object.__setattr__(self, "names", tuple(self.names))
+        object.__setattr__(self, "names", tuple(str(name) for name in self.names))
 
     def of_classes(self, classes: Sequence[str]) -> Tensor:
         """The boxes (T, 7) of some classes."""
