@@ -16,7 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from hvnet.boxes import limit_angle
-from hvnet.data.frame import IMAGE_SIZE, Camera, Frame, Objects
+from hvnet.data.frame import IMAGE_ERRORS, IMAGE_SIZE, Camera, Frame, Objects
 from hvnet.data.labels import DONTCARE, Floats, Labels
 from hvnet.exceptions import InputError
 
@@ -65,7 +65,7 @@ class KittiFrames:
         labels = read_labels(folder / "label_2" / f"{name}.txt") if self.is_labelled(k) else _labels([])
         frame_camera(folder, name, labels)
         points = folder / "velodyne" / f"{name}.bin"
-        if points.stat().st_size % 16:
+        if not points.is_file() or points.stat().st_size % 16:
             read_points(points)  # which says what is wrong
         return [str(each) for each in labels.name if each != DONTCARE] if self.is_labelled(k) else None
 
@@ -235,7 +235,13 @@ def _is_number(text: str, whole: bool) -> bool:
 
 
 def write_labels(path: Path, labels: Labels) -> None:
-    """Writes a label file with two decimals, as KITTI's are, or, where there are scores, a result file with four."""
+    """Writes a label file with two decimals, as KITTI's are, or, where there are scores, a result file with four.
+
+    Raises ValueError for a class that is not one word: such a file could not be read.
+    """
+    split = [str(name) for name in labels.name if len(str(name).split()) != 1]
+    if split:
+        raise ValueError(f"labels: want classes of one word each, got '{split[0]}'")
     digits = 2 if labels.score is None else 4
     lines = []
     for k in range(len(labels)):
@@ -371,7 +377,7 @@ def _image_size(path: Path) -> tuple[int, int]:
     try:
         with Image.open(path) as image:  # reads the header only
             return image.size
-    except OSError as error:
+    except IMAGE_ERRORS as error:
         raise InputError(f"{path}: not an image; replace or remove it") from error
 
 
