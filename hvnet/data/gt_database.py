@@ -37,7 +37,7 @@ class Database:
     centre_mm: NDArray[np.int32]  # (K, 3) centre of the box, millimetres
     box: NDArray[np.float32]  # (K, 7) x, y, z of the centre, length, width, height, yaw
     name: NDArray[np.str_]  # (K,) KITTI class
-    frame: NDArray[np.int32]  # (K,) frame id
+    frame: NDArray[np.int32]  # (K,) number of the frame
     label_row: NDArray[np.int16]  # (K,) row of the frame's label file
     truncation: NDArray[np.float32]  # (K,) as in the label file
     occlusion: NDArray[np.int8]  # (K,) as in the label file
@@ -88,15 +88,18 @@ def build_database(frames: Frames, wanted: Sequence[int] | None = None) -> Datab
     """Cuts every labelled object out of these frames, or those of them that are wanted.
 
     An object's points are those in or on its box, of the whole cloud: a truncated one has points beside the image.
-    The database keeps numbers of frames: their names, or their places where names are no numbers. Raises InputError for
-    such a name in a KITTI root, whose database is a file.
+    The database keeps numbers of frames: their names in a KITTI root, whose database is a file, else their places.
+    Raises InputError for a name in a KITTI root that is no number.
     """
     columns: dict[str, list[NDArray]] = {field.name: [] for field in fields(Database) if field.name != "offsets"}
     counts: list[int] = []
     for k in tqdm(range(len(frames)) if wanted is None else wanted, desc="objects", unit="frame"):
         name = frames.names[k]
-        if not name.isdecimal() and isinstance(frames, KittiFrames):
-            raise InputError(f"frame '{name}': is no number; the database keeps numbers")
+        number = k
+        if isinstance(frames, KittiFrames):
+            if not name.isdecimal() or int(name) >= 2**31:
+                raise InputError(f"frame '{name}': is no number below 2**31; the database keeps numbers")
+            number = int(name)
         frame = frames[k]
         if frame.objects is None:
             raise InputError(f"frame {name}: has no labels to cut objects out")
@@ -105,6 +108,8 @@ def build_database(frames: Frames, wanted: Sequence[int] | None = None) -> Datab
             every = boxes_to_labels(boxes.double().numpy(), frame.objects.names)
         rows = np.flatnonzero(every.name != DONTCARE)
         labels = every.select(rows)
+        if frame.objects.labels is None:
+            boxes = boxes[rows]
         centre_mm = (boxes[:, :3].double() * 1000).round()
         for row, centre, inside in zip(rows, centre_mm, points_in_boxes(frame.points, boxes).T, strict=True):
             points = frame.points[inside].double()
@@ -120,7 +125,7 @@ def build_database(frames: Frames, wanted: Sequence[int] | None = None) -> Datab
         columns["centre_mm"].append(centre_mm.numpy())
         columns["box"].append(boxes.numpy())
         columns["name"].append(labels.name)
-        columns["frame"].append(np.full(len(rows), int(name) if name.isdecimal() else k))
+        columns["frame"].append(np.full(len(rows), number))
         columns["label_row"].append(rows)
         columns["truncation"].append(labels.truncation)
         columns["occlusion"].append(labels.occlusion)
