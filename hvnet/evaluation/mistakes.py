@@ -38,15 +38,20 @@ def find_mistakes(frame: Frame, detections: Detections, rules: Mapping[str, Rule
     `rules` are those of the classes, in the order that the detections' labels (M,) number.
 
     A labelled box of one of the classes is missed if no detection of its class with score >= min_score reaches the BEV
-    IoU of the class's rule. A miss with an overlap above it was found, with a lower score.
+    IoU of the class's rule. A miss with an overlap above it was found, with a lower score. Where there is a camera, a
+    box with nothing in the image is no miss, as `frame_labels` leaves it out.
 
     A detection with score >= min_score is a false positive if it reaches that IoU with no label of its class, unless
     KITTI does not score it: where a Van lies under a Car or a Person_sitting under a Pedestrian, where more than half
     of its 2D box is in a DontCare region, or where none of it is in the image.
     """
+    labels, objects = frame_labels(frame), frame.objects
+    assert objects is not None
     unscored = torch.zeros(len(detections.boxes), dtype=torch.bool)
+    in_image = torch.ones(len(objects.boxes), dtype=torch.bool)
     if frame.camera is not None:
-        labels = frame_labels(frame)
+        if objects.labels is None:
+            in_image = torch.from_numpy(frame.camera.project_boxes(objects.boxes.double().numpy())[1])
         bbox, visible = frame.camera.project_boxes(detections.boxes.double().numpy())
         regions = labels.bbox[labels.name == DONTCARE]
         unscored = torch.from_numpy(~visible | (_largest_share(bbox, regions) > 0.5))
@@ -63,10 +68,11 @@ def find_mistakes(frame: Frame, detections: Detections, rules: Mapping[str, Rule
         own = detections.labels == label
         boxes, scores, left_out = detections.boxes[own], detections.scores[own], unscored[own]
         counts = scores >= min_score
-        truth = frame.boxes_of([name])
+        of_class = torch.tensor([each == name for each in objects.names], dtype=torch.bool)
+        truth = objects.boxes[of_class]
         iou = rotated_iou_bev(truth, boxes)  # (T, M_own)
 
-        missed = _largest(iou[:, counts], dim=1)[0] < enough
+        missed = (_largest(iou[:, counts], dim=1)[0] < enough) & in_image[of_class]
         overlaps, best = _largest(iou, dim=1)
         score_of_best = torch.where(overlaps > 0, scores[best] if len(scores) else 0.0, 0.0)
         note(MISS, name, truth[missed], score_of_best[missed], overlaps[missed])
