@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hvnet.cli import add_changes, add_device, make_parser, run_command
-from hvnet.devices import select_device
 from hvnet.exceptions import InputError
+from hvnet.network.devices import select_device
 from hvnet.studies.catalogue import STUDIES
 from hvnet.studies.study import Options, list_studies, locked, run_study
 

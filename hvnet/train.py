@@ -6,8 +6,8 @@ from pathlib import Path
 from hvnet import ranks
 from hvnet.cli import add_changes, add_device, make_parser, run_command
 from hvnet.config import load_config
-from hvnet.devices import select_device
 from hvnet.exceptions import InputError
+from hvnet.network.devices import select_device
 from hvnet.network.model import HVNet
 from hvnet.training.batches import generated_scenes, kitti_data
 from hvnet.training.folder import check_folder, check_room

@@ -1,5 +1,8 @@
 """Warp's start-up, the bridge from torch to Warp, and the checks at the boundary."""
 
+# inside a kernel Warp's types are calls, and its tensors have no types that mypy knows
+# mypy: disable-error-code="valid-type,attr-defined,no-untyped-def,name-defined,misc,operator,index,arg-type"
+
 import functools
 import os
 from collections.abc import Sequence
@@ -32,6 +35,19 @@ def start() -> None:
         os.close(silence)
 
 
+def cuda_problem() -> str | None:
+    """Why CUDA tensors cannot be used where torch sees a GPU, and what to do; None if they can, or torch sees none."""
+    if not torch.cuda.is_available():
+        return None
+    start()
+    if wp.is_cuda_available():
+        return None
+    return (
+        f"torch sees a GPU, but Warp {wp.__version__} does not: its wheels on PyPI need an NVIDIA driver of the 580 "
+        "series or newer; update the driver, install the +cu12 wheel of Warp's GitHub releases, or use the CPU"
+    )
+
+
 def array(tensor: Tensor, lanes: int = 0) -> Any:
     """A Warp view of a contiguous tensor; with lanes > 0 its last dimension, (.., lanes), becomes one vector.
 
@@ -59,6 +75,8 @@ def launch(kernel: wp.Kernel, dim: int | Sequence[int], inputs: Sequence[object]
     """Launches a kernel on the CPU, or on torch's current stream of a CUDA device."""
     start()
     if device.type == "cuda":
+        if not wp.is_cuda_available():
+            raise RuntimeError(cuda_problem() or "Warp sees no GPU")
         stream = wp.stream_from_torch(torch.cuda.current_stream(device))
         wp.launch(kernel, dim=dim, inputs=inputs, stream=stream, record_tape=False)
     else:

@@ -7,6 +7,9 @@ integral of clamp(x, -l/2, l/2) dy along the edges of b where |y| <= w/2. That h
 case, and it is continuous, so that touching, identical and nearly parallel edges are as exact as any other.
 """
 
+# inside a kernel Warp's types are calls, and its tensors have no types that mypy knows
+# mypy: disable-error-code="valid-type,attr-defined,no-untyped-def,name-defined,misc,operator,index,arg-type"
+
 import functools
 from itertools import pairwise
 from numbers import Real

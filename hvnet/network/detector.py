@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from hvnet.devices import select_device
 from hvnet.kernels.rotated import nms_order
 from hvnet.network.anchors import anchors_per_cell, decode
 from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint
+from hvnet.network.devices import select_device
 from hvnet.network.encoder import HybridVoxelEncoder
 from hvnet.network.fused import FusedEncoder, is_fused
 from hvnet.network.head import LOCATION_VALUES, Head, scores_of

@@ -16,12 +16,12 @@ from hvnet.config import Config, config_to_dict
 from hvnet.data.frame import Frames
 from hvnet.data.kitti import KittiFrames
 from hvnet.data.labels import no_results
-from hvnet.devices import device_name
 from hvnet.evaluation.precision import evaluate
 from hvnet.evaluation.scoring import labels_in_range, score
 from hvnet.exceptions import InputError
 from hvnet.kernels.voxel import make_grid
 from hvnet.network.detector import load
+from hvnet.network.devices import device_name
 from hvnet.network.model import HVNet
 from hvnet.network.pillars import hard_voxels
 from hvnet.studies.catalogue import Row

@@ -12,9 +12,9 @@ import torch
 from hvnet.cli import add_device, make_parser, run_command
 from hvnet.config import load_config
 from hvnet.data.gt_database import FILE_NAME
-from hvnet.devices import select_device
 from hvnet.exceptions import InputError
 from hvnet.network.checkpoint import load_checkpoint, save_checkpoint
+from hvnet.network.devices import select_device
 from hvnet.network.model import HVNet
 from hvnet.training.batches import kitti_data
 from hvnet.training.folder import check_folder, check_room

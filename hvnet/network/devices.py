@@ -1,19 +1,30 @@
 """The device to run on, and what it is called."""
 
 import platform
+import warnings
 from pathlib import Path
 
 import torch
 
 from hvnet.exceptions import InputError
+from hvnet.kernels.launch import cuda_problem
 
 
 def select_device(name: str) -> torch.device:
-    """The device named auto, cpu or cuda (or cuda:1, ...); auto is CUDA where there is a GPU. Raises InputError."""
+    """The device named auto, cpu or cuda (or cuda:1, ...); auto is CUDA where there is a GPU that torch and Warp see.
+
+    Raises InputError.
+    """
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
-    if name.startswith("cuda") and not torch.cuda.is_available():
-        raise InputError(f"device {name}: torch sees no CUDA device; use cpu")
+        if name == "cuda" and (problem := cuda_problem()):
+            warnings.warn(f"{problem}; going on with the CPU", RuntimeWarning, stacklevel=2)
+            name = "cpu"
+    elif name.startswith("cuda"):
+        if not torch.cuda.is_available():
+            raise InputError(f"device {name}: torch sees no CUDA device; use cpu")
+        if problem := cuda_problem():
+            raise InputError(f"device {name}: {problem}")
     if name.partition(":")[0] not in ("cpu", "cuda"):
         raise InputError(f"device {name}: want auto, cpu or cuda")
     try:
