@@ -65,7 +65,7 @@ def main(argv: Sequence[str] | None) -> None:
             "--labels labels --predictions results --no-2d-filter",
             "--labels labels --predictions results --distance-bands 0-20 20-40",
             "--labels labels --predictions results --score 0.5 --classes Car",
-            "--labels labels --predictions results --classes Truck bicycle --overlap Truck=0.5",
+            "--labels labels --predictions results --classes Truck --overlap Truck=0.5",
         ],
     )
     parser.add_argument("--labels", type=Path, required=True, metavar="DIR", help="label files (KITTI's label_2)")

@@ -4,11 +4,16 @@ import importlib
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+import hvnet
 from hvnet.__main__ import COMMANDS
-from tests.test_layout import ROOT, modules
+from hvnet.cli import read_overlaps, run_command
+from hvnet.exceptions import InputError, Stopped
+from tests.helpers import ROOT
+from tests.test_layout import modules
 
 
 def run(name: str, argument: str, monkeypatch: pytest.MonkeyPatch) -> object:
@@ -27,8 +32,65 @@ def test_every_command_is_listed() -> None:
         if "run_command(main)" in path.read_text(encoding="utf-8")
     }
     assert set(COMMANDS) == found
-    out = subprocess.run([sys.executable, "-m", "hvnet"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    assert all(f"python -m hvnet.{name} " in out for name in COMMANDS)
+
+
+def call(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "hvnet", *arguments], cwd=ROOT, capture_output=True, text=True)
+
+
+def test_the_list_of_commands() -> None:
+    for arguments in ((), ("--help",), ("-h",)):
+        done = call(*arguments)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert all(f"  hvnet {name} " in done.stdout for name in COMMANDS)
+        assert max(map(len, done.stdout.splitlines())) <= 100
+    assert call("--version").stdout == f"hvnet {hvnet.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (("nonsense",), "hvnet: error: no command nonsense; there are detect, train"),
+        (("trian", "--help"), "hvnet: error: no command trian; did you mean train?"),
+        (("detect", "nothing.bin"), "error: nothing.bin: no such file or folder"),
+        (("detect", "--no-such-option"), "python -m hvnet.detect: error: "),
+        (("evaluate",), "python -m hvnet.evaluate: error: "),
+    ],
+)
+def test_a_wrong_call_ends_with_2_and_a_line(arguments: tuple[str, ...], line: str) -> None:
+    done = call(*arguments)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.strip().splitlines()[-1].startswith(line)
+
+
+def test_a_command_behind_the_name_of_the_package(tmp_path: Path) -> None:
+    """`hvnet COMMAND` hands its arguments on; weights is the one whose module has another name."""
+    done = call("weights", "--data", str(tmp_path))
+    assert done.returncode == 2
+    assert "gt_database.npz: no such file" in done.stderr
+
+
+def test_how_a_command_ends(capsys: pytest.CaptureFixture[str]) -> None:
+    def ends(error: BaseException) -> tuple[object, str, str]:
+        def main(_: object) -> None:
+            raise error
+
+        with pytest.raises(SystemExit) as caught:
+            run_command(main)
+        return caught.value.code, *capsys.readouterr()
+
+    assert ends(InputError("a.bin: is empty")) == (2, "", "error: a.bin: is empty\n")
+    assert ends(Stopped("stopped in epoch 1", 15)) == (143, "stopped in epoch 1\n", "")
+    assert ends(Stopped("", 2)) == (130, "", "")  # not the first of several ranks
+    assert ends(KeyboardInterrupt()) == (130, "", "interrupted\n")
+
+
+@pytest.mark.parametrize("given", ["Truck", "Truck=", "Truck=nan", "Truck=0", "Truck=1.1", "=0.5", "Lorry=0.5"])
+def test_overlaps_that_are_none(given: str) -> None:
+    with pytest.raises(InputError, match=f"--overlap {re.escape(given)}: "):
+        read_overlaps([given], ["Truck"])
+    assert read_overlaps(["Truck=0.5", "a=b=1"], ["Truck", "a=b"]) == {"Truck": 0.5, "a=b": 1.0}
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -128,6 +128,8 @@ def test_twins_need_no_warp() -> None:
 @pytest.mark.parametrize("name", ["kernels", "configs"])
 def test_symlink(name: str) -> None:
     link = ROOT / "hvnet" / name
+    if not (ROOT / ".git").exists():
+        pytest.skip("an sdist holds folders in the place of links")
     assert link.is_symlink()
     assert link.readlink() == Path("..") / name
     assert not (ROOT / "kernels" / "__init__.py").exists()
