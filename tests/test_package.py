@@ -50,8 +50,9 @@ def test_types_are_known_to_others(tmp_path: Path) -> None:
 def test_what_is_packed(tmp_path: Path) -> None:
     """The sdist holds all that git tracks but settings, the wheel all of the package; neither anything else's."""
     pytest.importorskip("setuptools", "77", reason="the licence in pyproject.toml needs it")
-    code = "from setuptools import build_meta as b; import sys; b.build_sdist(sys.argv[1]); b.build_wheel(sys.argv[1])"
-    command = [sys.executable, "-c", code, str(tmp_path / "made")]
+    made = str(tmp_path / "made")
+    code = f"from setuptools import build_meta as b; b.build_sdist({made!r}); b.build_wheel({made!r})"
+    command = [sys.executable, "-c", code]
     source = tmp_path / "source"
     (tmp_path / "made").mkdir()
     if not (ROOT / ".git").exists():
