@@ -525,7 +525,7 @@ def test_no_minus_zero_without_a_camera(tmp_path: Path) -> None:
             assert not (np.signbit(places) & (places == 0)).any()
 
 
-CLASSES = ["car", "lkw3", "Traffic_cone", "e-scooter", "3wheeler", "Fußgänger"]
+CLASSES = ["car", "lorry3", "Traffic_cone", "e-scooter", "3wheeler", "Fußgänger"]
 
 
 @pytest.mark.parametrize("scored", [False, True])

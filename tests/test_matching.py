@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from shapely import affinity, box
 
-from hvnet.data.kitti import Labels
-from hvnet.matching import (
+from hvnet.data.labels import Labels
+from hvnet.evaluation.matching import (
     LEVELS,
-    METRICS,
     Candidates,
     Level,
     Matching,
@@ -19,6 +18,7 @@ from hvnet.matching import (
     found_scores,
     match_at,
 )
+from hvnet.evaluation.rules import METRICS
 
 FRAMES, TRUTHS, DETECTIONS = 80, 8, 10
 
@@ -85,7 +85,7 @@ def candidates() -> Candidates:
 
 @pytest.mark.parametrize("metric", METRICS)
 @pytest.mark.parametrize("level", LEVELS)
-def test_counts_at_every_score(candidates: Candidates, metric: str, level: Level):
+def test_counts_at_every_score(candidates: Candidates, metric: str, level: Level) -> None:
     matching = clean_data(candidates, "Car", metric, 0.3, level)
     counts = count(matching, candidates)
     assert counts.true_positives.max() >= 3
@@ -96,7 +96,7 @@ def test_counts_at_every_score(candidates: Candidates, metric: str, level: Level
         np.testing.assert_allclose(fast, slow, atol=1e-9)
 
 
-def test_counts_agree_with_the_matching_at_one_score(candidates: Candidates):
+def test_counts_agree_with_the_matching_at_one_score(candidates: Candidates) -> None:
     matching = clean_data(candidates, "Car", "bev", 0.3, LEVELS[2])
     counts = count(matching, candidates)
     for k, threshold in enumerate(counts.score):
@@ -105,7 +105,7 @@ def test_counts_agree_with_the_matching_at_one_score(candidates: Candidates):
         assert (matching.countable & ~taken & (candidates.score >= threshold)).sum() == counts.false_positives[k]
 
 
-def test_overlaps_are_those_of_polygons(candidates: Candidates):
+def test_overlaps_are_those_of_polygons(candidates: Candidates) -> None:
     """Footprints by shapely in the camera's x and z, turned by rotation_y about y, which points down."""
 
     def footprint(labels: Labels, row: int):  # type: ignore[no-untyped-def]
@@ -128,7 +128,7 @@ def test_overlaps_are_those_of_polygons(candidates: Candidates):
         assert volume.overlap[k] == pytest.approx(shared / total, abs=1e-9)
 
 
-def test_first_pass_goes_by_score_and_second_by_overlap():
+def test_first_pass_goes_by_score_and_second_by_overlap() -> None:
     """A car and two detections of it: one fits better, the other is scored higher."""
     rng = np.random.default_rng(0)
     car = random_frame(rng, 1, scored=False)
@@ -145,7 +145,7 @@ def test_first_pass_goes_by_score_and_second_by_overlap():
     assert match_at(matching, candidates, 0.3)[0].tolist() == [1]
 
 
-def test_boxes_without_a_size_overlap_nothing():
+def test_boxes_without_a_size_overlap_nothing() -> None:
     rng = np.random.default_rng(0)
     truths, detections = random_frame(rng, 3, scored=False), random_frame(rng, 3, scored=True)
     detections.dimensions[:] = -1
@@ -154,14 +154,14 @@ def test_boxes_without_a_size_overlap_nothing():
     assert [len(candidates.pairs[metric].overlap) for metric in METRICS] == [0, 0, 0]
 
 
-def test_no_objects_at_all():
+def test_no_objects_at_all() -> None:
     empty = random_frame(np.random.default_rng(0), 0, scored=True)
     candidates = find_candidates([empty, empty], [empty, empty])
     matching = clean_data(candidates, "Car", "3d", 0.7, LEVELS[0])
     assert len(count(matching, candidates).score) == len(found_scores(matching, candidates)) == 0
 
 
-def test_predictions_without_scores_are_refused():
+def test_predictions_without_scores_are_refused() -> None:
     frame = random_frame(np.random.default_rng(0), 2, scored=False)
     with pytest.raises(ValueError, match="want a score"):
         find_candidates([frame], [frame])

@@ -1,22 +1,22 @@
 """Mistakes: tables of labelled boxes and detections, and what KITTI does not score."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from hvnet.data.kitti import AT_LIDAR, Calibration, Frame, Labels, boxes_to_camera, project_boxes, read_frame
-from hvnet.mistakes import FALSE_POSITIVE, MISS, Mistake, find_mistakes, worst
-from hvnet.model import Detections
+from hvnet.data.frame import Camera, Frame, Objects
+from hvnet.data.kitti import boxes_to_camera, read_frame
+from hvnet.data.labels import Labels
+from hvnet.evaluation.mistakes import FALSE_POSITIVE, MISS, Mistake, find_mistakes, worst
+from hvnet.evaluation.rules import KITTI, Rule, rule_for
+from hvnet.network.model import Detections
+from tests import helpers
 
-CLASSES = ("Car", "Pedestrian", "Cyclist")
-SIZE = (1000, 400)
-CALIB = Calibration(
-    p2=np.array([[500.0, 0, 500, 0], [0, 500, 200, 0], [0, 0, 1, 0]]),
-    r0_rect=AT_LIDAR.r0_rect,
-    velo_to_cam=AT_LIDAR.velo_to_cam,
-)
+CLASSES = tuple(KITTI)
+CAMERA = replace(helpers.CAMERA, p2=np.array([[500.0, 0, 500, 0], [0, 500, 200, 0], [0, 0, 1, 0]]), size=(1000, 400))
 LENGTH = 4.0
 
 
@@ -34,8 +34,8 @@ def make_frame(
 ) -> Frame:
     boxes = torch.tensor([box for _, box in objects]).view(-1, 7)
     regions = np.array(dontcare or []).reshape(-1, 4)
-    dimensions, location, rotation_y = boxes_to_camera(boxes.numpy(), CALIB)
-    bbox, _ = project_boxes(boxes.numpy(), CALIB, SIZE)
+    dimensions, location, rotation_y = boxes_to_camera(boxes.numpy(), CAMERA)
+    bbox, _ = CAMERA.project_boxes(boxes.numpy())
     count, extra = len(objects), len(regions)
     labels = Labels(
         name=np.array([name for name, _ in objects] + ["DontCare"] * extra, dtype=np.str_),
@@ -49,7 +49,7 @@ def make_frame(
     )
     names = tuple(name for name, _ in objects)
     cloud = torch.tensor(points).view(-1, 3)
-    return Frame("000007", torch.nn.functional.pad(cloud, (0, 1)), boxes, names, labels, CALIB, SIZE, 0)
+    return Frame("000007", torch.nn.functional.pad(cloud, (0, 1)), Objects(boxes, names, labels), CAMERA)
 
 
 def detections(*rows: tuple[str, list[float], float]) -> Detections:
@@ -102,7 +102,7 @@ POINTS = [[10.0, 0.5, 0.0], [10.5, -0.5, 0.0], [30.0, 0.0, 0.0], [10.0, 1.5, 0.0
 @pytest.mark.parametrize("case", TABLE)
 def test_table(case: str) -> None:
     objects, found, expected = TABLE[case]
-    mistakes = find_mistakes(make_frame(objects, POINTS), detections(*found), CLASSES, 0.5)
+    mistakes = find_mistakes(make_frame(objects, POINTS), detections(*found), KITTI, 0.5)
     assert summary(mistakes) == expected
     for each in mistakes:
         assert each.frame == "000007"
@@ -112,35 +112,85 @@ def test_table(case: str) -> None:
 @pytest.mark.parametrize(("share", "count"), [(0.0, 1), (0.45, 1), (0.55, 0), (1.0, 0)])
 def test_dontcare_covers_more_than_half(share: float, count: int) -> None:
     box = car(20)
-    left, top, right, bottom = project_boxes(np.array([box]), CALIB, SIZE)[0][0]
+    left, top, right, bottom = CAMERA.project_boxes(np.array([box]))[0][0]
     region = [left, top, left + share * (right - left), bottom]
     frame = make_frame([], [], [region, [0, 0, 1, 1]])
-    assert len(find_mistakes(frame, detections(("Car", box, 0.9)), CLASSES, 0.5)) == count
+    assert len(find_mistakes(frame, detections(("Car", box, 0.9)), KITTI, 0.5)) == count
 
 
 def test_worst_come_first() -> None:
     objects = [("Car", car(30)), ("Car", car(10)), ("Car", car(50))]
     found = detections(("Car", car(70), 0.6), ("Car", car(80), 0.8), ("Pedestrian", car(90), 0.7))
-    mistakes = find_mistakes(make_frame(objects, POINTS), found, CLASSES, 0.5)
+    mistakes = find_mistakes(make_frame(objects, POINTS), found, KITTI, 0.5)
     misses, wrong = worst(mistakes, 2)
     assert [each.points for each in misses] == [2, 1]
     assert [round(each.score, 1) for each in wrong] == [0.8, 0.7]
     assert [len(each) for each in worst(mistakes, 20)] == [3, 3]
 
 
-def test_a_class_that_kitti_does_not_score_has_none() -> None:
+def test_a_neighbour_that_is_scored_itself() -> None:
+    """Where vans are scored, one that is not found is a miss, and a car found there is wrong."""
     frame = make_frame([("Van", car(10)), ("Car", car(30))], POINTS)
-    mistakes = find_mistakes(frame, detections(("Car", car(20), 0.9)), ("Van", *CLASSES[1:], "Car"), 0.5)
-    assert summary(mistakes) == [(MISS, "Car", 30, 0, 0, 1)]
+    rules = {"Car": KITTI["Car"], "Van": rule_for("Van", 5.0)}
+    found = Detections(torch.tensor([car(10), car(30)]), torch.tensor([0.9, 0.8]), torch.tensor([0, 0]))
+    assert summary(find_mistakes(frame, found, rules, 0.5)) == [
+        (MISS, "Van", 10, 0, 0, 2),
+        (FALSE_POSITIVE, "Car", 10, 0.9, 0, 2),
+    ]
+    assert find_mistakes(frame, found, KITTI, 0.5) == []
+
+
+OWN = {"excavator": rule_for("excavator", 4.0), "bicycle": rule_for("bicycle", 1.8, 0.25)}
+
+
+def found_as(*rows: tuple[int, list[float]]) -> Detections:
+    boxes = torch.tensor([box for _, box in rows]).view(-1, 7)
+    return Detections(boxes, torch.full((len(rows),), 0.9), torch.tensor([label for label, _ in rows]).long())
+
+
+@pytest.mark.parametrize("camera", [None, CAMERA])
+def test_any_class_by_its_rule(camera: Camera | None) -> None:
+    """Frames of another format: without rows of a label file, with or without a camera."""
+    objects = Objects(torch.tensor([car(10), car(30), car(50)]), ["excavator", "bicycle", "cone"])
+    frame = Frame("a", torch.zeros(0, 4), objects, camera)
+    found = found_as((0, shifted(10, 0.65)), (1, shifted(30, 0.3)))
+    assert [(each.kind, each.name) for each in find_mistakes(frame, found, OWN, 0.5)] == [
+        (MISS, "excavator"),
+        (FALSE_POSITIVE, "excavator"),
+    ]
+    wide = OWN | {"excavator": Rule(dict.fromkeys(("2d", "bev", "3d"), 0.6), {})}
+    assert find_mistakes(frame, found, wide, 0.5) == []
+
+
+def test_what_is_outside_the_image_is_no_mistake() -> None:
+    """As in the evaluation, where boxes that the camera does not see have no row; without a camera all are seen."""
+    objects = Objects(torch.tensor([car(-10), car(10)]), ["excavator", "excavator"])
+    nothing = found_as()
+    seen = find_mistakes(Frame("a", torch.zeros(0, 4), objects, CAMERA), nothing, OWN, 0.5)
+    assert [each.box[0].item() for each in seen] == [10]
+    every = find_mistakes(Frame("a", torch.zeros(0, 4), objects), nothing, OWN, 0.5)
+    assert [each.box[0].item() for each in every] == [-10, 10]
+    behind = found_as((0, car(-30)))
+    empty = Objects(torch.zeros(0, 7), [])
+    assert find_mistakes(Frame("a", torch.zeros(0, 4), empty, CAMERA), behind, OWN, 0.5) == []
+    assert len(find_mistakes(Frame("a", torch.zeros(0, 4), empty), behind, OWN, 0.5)) == 1
+
+
+@pytest.mark.parametrize("camera", [None, CAMERA])
+def test_a_frame_without_labels_is_refused(camera: Camera | None) -> None:
+    """What nobody labelled cannot be found wrong."""
+    with pytest.raises(ValueError, match="frame a: has no labels"):
+        find_mistakes(Frame("a", torch.zeros(0, 4), None, camera), found_as((0, car(10))), OWN, 0.5)
 
 
 def test_labels_as_detections_are_no_mistakes(kitti_root: Path) -> None:
     """In real frames: none if all labels are detected, and as many as there are labels if nothing is."""
     for name in (kitti_root / "ImageSets" / "val.txt").read_text().split():
         frame = read_frame(kitti_root, name)
-        known = [each in CLASSES for each in frame.names]
-        labels = torch.tensor([CLASSES.index(each) for each in frame.names if each in CLASSES]).long()
-        perfect = Detections(frame.boxes[known], torch.ones(len(labels)), labels)
-        assert find_mistakes(frame, perfect, CLASSES, 0.5) == []
-        nothing = find_mistakes(frame, detections(), CLASSES, 0.5)
+        assert frame.objects is not None
+        known = [each for each in frame.objects.names if each in CLASSES]
+        labels = torch.tensor([CLASSES.index(each) for each in known]).long()
+        perfect = Detections(frame.boxes_of(CLASSES), torch.ones(len(labels)), labels)
+        assert find_mistakes(frame, perfect, KITTI, 0.5) == []
+        nothing = find_mistakes(frame, detections(), KITTI, 0.5)
         assert [each.kind for each in nothing] == [MISS] * len(labels)

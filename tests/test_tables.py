@@ -1,0 +1,39 @@
+"""The result of an evaluation for people: its width and its columns, the curves as CSV, and the plot of them."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from hvnet.evaluation.matching import distance_levels
+from hvnet.evaluation.precision import evaluate
+from hvnet.evaluation.tables import format_table, plot, write_csv
+from tests.helpers import crowd, rows
+
+
+def test_table_is_at_most_100_columns_wide_and_aligned() -> None:
+    result = evaluate([crowd()], [crowd(scored=True)], points=[np.arange(3 * 60)])
+    four = evaluate([crowd()], [crowd(scored=True)], levels=distance_levels([(0, 20), (20, 40), (40, 80), (80, 999)]))
+    for lines in (format_table(result).splitlines(), format_table(four).splitlines()):
+        assert max(map(len, lines)) <= 100
+        assert len({len(line) for line in lines if line.startswith(("2d ", "aos", "bev 0", "3d  0", "overlap"))}) == 1
+
+
+def test_a_class_without_detections_has_one_line() -> None:
+    result = evaluate([rows("Tram 0 20 100 50")], [rows(scored=True)], classes=["Tram"])
+    assert format_table(result) == "Tram: no detections; ground truths: 1 easy, 1 moderate, 1 hard"
+
+
+def test_loose_overlaps_stand_where_they_differ(tmp_path: Path) -> None:
+    """In the table, the curves and the plot; that of 2D boxes is the strict one."""
+    result = evaluate([rows("Tram 0 20 100 50")], [rows("Tram 0 20 100 50 score=0.5", scored=True)], classes=["Tram"])
+    lines = [line.split()[:2] for line in format_table(result).splitlines() if line[:3] in ("2d ", "bev", "3d ", "aos")]
+    strict = [["2d", "0.70"], ["aos", "0.70"], ["bev", "0.70"], ["3d", "0.70"]]
+    assert lines[:6] == [*strict, ["bev", "0.50"], ["3d", "0.50"]]
+    write_csv(tmp_path / "a.csv", result)
+    with (tmp_path / "a.csv").open(newline="") as file:
+        curves = [(row["class"], row["metric"], row["overlap"]) for row in csv.DictReader(file)]
+    expected = [("2d", "0.7"), ("bev", "0.7"), ("3d", "0.7"), ("bev", "0.5"), ("3d", "0.5")]
+    assert curves == [("Tram", *each) for each in expected for _ in range(3)]
+    plot(tmp_path / "a.png", result)
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
