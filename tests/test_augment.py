@@ -23,7 +23,7 @@ from hvnet.data.augment import (
     sample_frame,
     sample_objects,
 )
-from hvnet.data.database import Database, read_database
+from hvnet.data.gt_database import Database, read_database
 from hvnet.data.kitti import read_frame
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
@@ -308,17 +308,19 @@ def test_mixing_with_an_empty_frame_leaves_a_side() -> None:
 def test_real_frame_with_the_real_database(kitti_root: Path) -> None:
     database = objects_of(read_database(kitti_root / "gt_database.npz"), torch.device("cpu"))
     frame = read_frame(kitti_root, "000008")
-    labels = torch.tensor([CLASSES.index(name) if name in CLASSES else -1 for name in frame.names])
-    points, boxes, classes = sample_objects(frame.points, frame.boxes, labels, database, COUNTS, seeded(), CLASSES)
-    inserted = boxes[len(frame.boxes) :]
+    assert frame.objects is not None
+    own_boxes, names = frame.objects.boxes, frame.objects.names
+    labels = torch.tensor([CLASSES.index(name) if name in CLASSES else -1 for name in names])
+    points, boxes, classes = sample_objects(frame.points, own_boxes, labels, database, COUNTS, seeded(), CLASSES)
+    inserted = boxes[len(own_boxes) :]
     assert 15 < len(inserted) <= 25
-    assert torch.equal(boxes[: len(frame.boxes)], frame.boxes)
+    assert torch.equal(boxes[: len(own_boxes)], own_boxes)
     assert all((classes == CLASSES.index(name)).sum() <= count for name, count in COUNTS.items())
     collisions = boxes_collide(boxes, boxes)
     # the frame's own boxes may touch; an inserted one meets none but itself
-    assert collisions[len(frame.boxes) :].sum() == len(inserted)
-    own = points_in_boxes(frame.points, frame.boxes).sum(0)
-    assert torch.equal(points_in_boxes(points, frame.boxes).sum(0), own)
+    assert collisions[len(own_boxes) :].sum() == len(inserted)
+    own = points_in_boxes(frame.points, own_boxes).sum(0)
+    assert torch.equal(points_in_boxes(points, own_boxes).sum(0), own)
     # all that is in an inserted box came with it
     begun = len(frame.points) - points_in_boxes(frame.points, inserted).any(1).sum()
     assert not points_in_boxes(points[:begun], inserted).any()

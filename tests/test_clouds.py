@@ -139,8 +139,8 @@ def test_spoilt_bytes_give_points_or_the_error(tmp_path: Path, kind: str) -> Non
     rng = np.random.default_rng(0)
     for _ in range(60):
         spoilt = bytearray(whole)
-        for at in rng.integers(0, min(260, len(whole)), 2):  # the header
-            spoilt[at] = rng.integers(256)
+        for place in rng.integers(0, min(260, len(whole)), 2):  # the header
+            spoilt[place] = rng.integers(256)
         if rng.random() < 0.5:
             del spoilt[rng.integers(len(spoilt)) :]
         path.write_bytes(spoilt)
