@@ -13,15 +13,16 @@ import numpy as np
 import pytest
 import torch
 
-from hvnet.cli import InputError
 from hvnet.config import config_to_dict, load_config
 from hvnet.data.clouds import read_cloud
 from hvnet.data.kitti import read_calibration, read_labels
 from hvnet.detect import main
-from hvnet.detector import Detector, load
-from hvnet.model import HVNet, load_checkpoint, model_from_checkpoint, save_checkpoint
+from hvnet.exceptions import InputError
+from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint, save_checkpoint
+from hvnet.network.detector import Detector, load
+from hvnet.network.model import HVNet
+from tests.helpers import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 NARROW = ["encoder.point_range=[0, -3.2, -3, 12.8, 3.2, 2]", "head.score_threshold=0.0", "head.candidates=50"]
 SECONDS = 10.0  # that any one of them may take
 LARGE = 64 * 2**20
@@ -74,8 +75,8 @@ def damaged(content: bytes, generator: np.random.Generator) -> bytes:
         return content[: generator.integers(0, len(content))]
     if kind == 2:
         flipped = bytearray(content)
-        for at in generator.integers(0, len(content), 8):
-            flipped[at] = int(generator.integers(0, 256))
+        for place in generator.integers(0, len(content), 8):
+            flipped[place] = int(generator.integers(0, 256))
         return bytes(flipped)
     if kind == 3:
         lines = content.splitlines(keepends=True)
@@ -111,8 +112,8 @@ def text_file(generator: np.random.Generator, content: str, suffix: str) -> tupl
     if generator.random() < 0.2:
         return suffix, generator.bytes(size_of(generator))
     words = content.split(" ")
-    for at in generator.integers(0, len(words), int(generator.integers(0, 3))):
-        odd = [
+    for place in generator.integers(0, len(words), int(generator.integers(0, 3))):
+        strange = [
             "nan",
             "inf",
             "-inf",
@@ -129,7 +130,7 @@ def text_file(generator: np.random.Generator, content: str, suffix: str) -> tupl
             "*",
             "~",
         ]
-        words[at] = str(generator.choice(odd))
+        words[place] = str(generator.choice(strange))
     return suffix, damaged(" ".join(words).encode(), generator)
 
 
