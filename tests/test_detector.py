@@ -8,13 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from hvnet.cli import InputError
 from hvnet.config import ClassConfig, Config, config_to_dict, load_config
 from hvnet.data.kitti import read_frame
-from hvnet.detector import Detector, fold_batch_norms, load, regress, regression_weight
-from hvnet.head import Head
+from hvnet.exceptions import InputError
 from hvnet.kernels.rotated import rotated_iou_bev
-from hvnet.model import Detections, HVNet, save_checkpoint
+from hvnet.network.checkpoint import save_checkpoint
+from hvnet.network.detector import Detector, fold_batch_norms, load, regress, regression_weight
+from hvnet.network.head import Head
+from hvnet.network.model import Detections, HVNet
 from tests.models import CONFIGS, NARROW, lively, some_points
 
 CPU = torch.device("cpu")

@@ -5,6 +5,7 @@ import dataclasses
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,9 +13,12 @@ from torch import Tensor
 
 from hvnet.config import EncoderConfig
 from hvnet.data.kitti import read_frame
-from hvnet.encoder import VFE, AttentiveVFE, FusedEncoder, HybridVoxelEncoder, projection_grids
 from hvnet.kernels import reference
 from hvnet.kernels.voxel import Grid
+from hvnet.network.encoder import VFE, AttentiveVFE, HybridVoxelEncoder
+from hvnet.network.fused import FusedEncoder, inference, is_fused
+from hvnet.network.grids import projection_grids
+from hvnet.network.model import make_encoder
 
 # not square, so that a transpose of x and y would be seen
 SMALL = EncoderConfig(
@@ -207,7 +211,7 @@ def test_fused_encoder_gives_the_same_images(
         SMALL, feature_scales=feature_scales, projection_scales=projection_scales, attention_relu=relu
     )
     encoder = trained(config)
-    fused = FusedEncoder(encoder)
+    fused = inference(encoder)
     # the second cloud must find no trace of the first, an empty one and one point leave nothing else
     for points, sample in (cloud(400), cloud(100, seed=1), cloud(0), cloud(1, seed=4), cloud(400)):
         with torch.no_grad():
@@ -215,6 +219,48 @@ def test_fused_encoder_gives_the_same_images(
         for image, plain in zip(fused(points, sample, 2), expected, strict=True):
             assert image.is_contiguous(memory_format=torch.channels_last)
             torch.testing.assert_close(image, plain, rtol=1e-4, atol=1e-4)  # products of two sums in float32
+
+
+def test_the_two_steps_of_the_fused_encoder_give_its_images() -> None:
+    encoder = trained(SMALL)
+    fused, parts = FusedEncoder(encoder), FusedEncoder(encoder)
+    points, sample = cloud(300)
+    indexed = parts.index(points, sample)
+    product, maxima = parts.point_features(indexed)
+    with torch.no_grad():
+        images = parts.voxel_features(product, maxima, indexed, 2, torch.float32)
+    assert product.shape == (len(indexed.points), len(SMALL.feature_scales) * SMALL.feature_channels)
+    assert [len(values) for values in maxima] == [indexed.scales[grid].rows for grid in encoder.feature_grids]
+    for image, whole in zip(images, fused(points, sample, 2), strict=True):
+        assert torch.equal(image, whole)
+
+
+PILLARS = {"vfe": "pillar", "feature_scales": (1.0,), "projection_scales": (1.0,), "point_limit": 4, "voxel_limit": 9}
+
+
+@pytest.mark.parametrize(
+    ("changes", "fused"),
+    [
+        ({}, True),
+        ({"vfe": "plain"}, False),
+        ({"point_limit": 4}, False),
+        ({"feature_scales": (1.0, 1.5)}, False),  # they do not nest
+        (
+            {
+                "vfe": "pillar",
+                "feature_scales": (1.0,),
+                "projection_scales": (1.0,),
+                "point_limit": 4,
+                "voxel_limit": 9,
+            },
+            False,
+        ),
+    ],
+)
+def test_which_encoders_are_fused(changes: dict[str, Any], fused: bool) -> None:
+    encoder = make_encoder(dataclasses.replace(SMALL, **changes))
+    assert is_fused(encoder, 1) is fused
+    assert not is_fused(encoder, 2**30)  # more cells than a key has bits
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -296,7 +342,8 @@ def test_memory_goes_by_points_not_by_cells() -> None:
     code = """if True:
         import math, resource, torch
         from hvnet.config import EncoderConfig
-        from hvnet.encoder import FusedEncoder, HybridVoxelEncoder
+        from hvnet.network.encoder import HybridVoxelEncoder
+        from hvnet.network.fused import FusedEncoder
 
         torch.set_num_threads(1)
         config = EncoderConfig(
@@ -349,7 +396,7 @@ def test_without_attention(
     for a, b in zip(own, other, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3 * float(b.abs().max()))
     if not training:
-        for own, other in zip(FusedEncoder(before)(points, sample, 2), images, strict=True):
+        for own, other in zip(inference(before)(points, sample, 2), images, strict=True):
             assert torch.equal(own, other)
 
 
@@ -372,6 +419,6 @@ def test_hard_voxels_drop_points_before_the_encoder(vfe: str) -> None:
             kept += [k] if of_sample[at] <= 2 else []
     assert 80 < len(kept) < 160
     expected = whole(points[kept], sample[kept], 2)
-    for run in (limited, FusedEncoder(limited)):
+    for run in (limited, inference(limited)):
         for own, other in zip(run(points, sample, 2), expected, strict=True):
             torch.testing.assert_close(own, other, rtol=1e-5, atol=1e-5)

@@ -14,17 +14,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from hvnet.anchors import make_anchors
-from hvnet.cli import InputError
 from hvnet.config import config_to_dict, load_config
 from hvnet.data.kitti import read_frame
-from hvnet.detector import SHIPPED
-from hvnet.export import describe, main, map_names, maps_of_class, write_onnx, write_program
-from hvnet.head import HeadMaps
-from hvnet.model import Detections, HVNet, load_checkpoint, model_from_checkpoint, save_checkpoint
+from hvnet.exceptions import InputError
+from hvnet.export import main
+from hvnet.network.anchors import make_anchors
+from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint, save_checkpoint
+from hvnet.network.detector import SHIPPED
+from hvnet.network.export import describe, map_names, maps_of_class, write_onnx, write_program
+from hvnet.network.head import HeadMaps
+from hvnet.network.model import Detections, HVNet
+from tests.helpers import ROOT
 from tests.models import NARROW, lively, some_clouds
 
-ROOT = Path(__file__).resolve().parents[1]
 DEMO = ROOT / "configs" / "demo.yaml"
 SMALL = [*NARROW, "head.score_threshold=0.02"]
 
@@ -163,7 +165,7 @@ def test_the_program_in_a_fresh_process(exported: Path, shipped: HVNet, scenes: 
     assert len(given[2]) == 2
     torch.save(given, tmp_path / "clouds.pt")
     code = (
-        "import sys, torch, hvnet.encoder\n"
+        "import sys, torch, hvnet.network.encoder\n"
         "program, clouds, maps = sys.argv[1:]\n"
         "run = torch.export.load(program).module()\n"
         "given = torch.load(clouds)\n"

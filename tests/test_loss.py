@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from hvnet.anchors import assign_targets
 from hvnet.config import LossConfig, load_config
-from hvnet.head import HeadMaps
 from hvnet.kernels.rotated import rotated_iou_bev
-from hvnet.loss import class_loss, iou_pairs
-from hvnet.model import HVNet
+from hvnet.network.anchors import assign_targets
+from hvnet.network.head import HeadMaps
+from hvnet.network.loss import class_loss, iou_pairs
+from hvnet.network.model import HVNet
 from tests.models import CONFIGS
 
 

@@ -8,14 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from hvnet.anchors import assign_targets, decode, encode, make_anchors
-from hvnet.backbone import FPN, Backbone
 from hvnet.boxes import bev_corners
 from hvnet.config import BackboneConfig, Config, LossConfig, load_config
-from hvnet.head import HeadMaps, anchor_rows
 from hvnet.kernels import reference
-from hvnet.loss import class_loss, focal_loss
-from hvnet.model import Detections, HVNet
+from hvnet.network.anchors import assign_targets, decode, encode, make_anchors
+from hvnet.network.backbone import FPN, Backbone
+from hvnet.network.head import HeadMaps, anchor_rows
+from hvnet.network.loss import class_loss, focal_loss
+from hvnet.network.model import Detections, HVNet
 from tests.models import CONFIGS, some_points
 
 

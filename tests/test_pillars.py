@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from hvnet.config import load_config
-from hvnet.data.kitti import read_frame
+from hvnet.data.kitti import read_frame, read_split
 from hvnet.kernels import reference
 from hvnet.kernels.voxel import is_nested, make_grid
-from hvnet.model import HVNet
-from hvnet.pillars import PillarEncoder, hard_voxels
+from hvnet.network.model import HVNet
+from hvnet.network.pillars import PillarEncoder, hard_voxels
 from tests.models import CONFIGS
 
 RANGE = (0.0, -2.0, -3.0, 4.0, 2.0, 2.0)
@@ -115,8 +115,8 @@ def test_pointpillars_has_the_numbers_of_its_paper() -> None:
     """Lang et al., Sec. 2 and 3: D = 9, C = 64, P = 12000, N = 100, pillars of 0.16 m; blocks of 4, 6 and 6 layers with
     C, 2 C, 4 C channels at strides 2, 4 and 8, each brought to 2 C at stride 2: 6 C = 384 for the head."""
     studies = CONFIGS / "studies"
-    instead = (studies / "base.yaml", CONFIGS / "hvnet.yaml")
-    config = load_config(studies / "voxel-size" / "pillars-0.16.yaml", instead=instead)
+    base = (studies / "base.yaml", CONFIGS / "hvnet.yaml")
+    config = load_config(studies / "voxel-size" / "pillars-0.16.yaml", replace_base=base)
     with torch.device("meta"):
         model = HVNet(config)
     assert isinstance(model.encoder, PillarEncoder)
@@ -142,8 +142,8 @@ def test_points_that_the_limit_drops_on_real_frames(kitti_root, size: float, sha
     """32 points a pillar, which most implementations take, in the paper's range."""
     grid = make_grid((0.0, -32.0, -3.0, 64.0, 32.0, 2.0), (size, size), 1.0)
     whole = kept = 0
-    for path in sorted((kitti_root / "training" / "velodyne").glob("*.bin")):
-        points = read_frame(kitti_root, path.stem).points
+    for name in read_split(kitti_root, "train_first") + read_split(kitti_root, "val_first"):
+        points = read_frame(kitti_root, name).points
         sample = torch.zeros(len(points), dtype=torch.int64)
         whole += len(hard_voxels(points, sample, 1, grid, 0, 0).point)
         kept += len(hard_voxels(points, sample, 1, grid, 32, 12000).point)

@@ -19,8 +19,7 @@ from hvnet.kernels.rotated import nms_order
 from hvnet.network.anchors import anchors_per_cell, decode
 from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint
 from hvnet.network.devices import select_device
-from hvnet.network.encoder import HybridVoxelEncoder
-from hvnet.network.fused import FusedEncoder, is_fused
+from hvnet.network.fused import inference, is_fused
 from hvnet.network.head import LOCATION_VALUES, Head, scores_of
 from hvnet.network.model import Detections, HVNet
 
@@ -53,9 +52,7 @@ class Detector:
         self.classes = tuple(entry.name for entry in model.config.head.classes)
         model = copy.deepcopy(model).to(device).eval()
         self.encoder = model.encoder
-        self.fused: FusedEncoder | None = None
-        if isinstance(model.encoder, HybridVoxelEncoder) and is_fused(model.encoder, 1):
-            self.fused = FusedEncoder(model.encoder)
+        self.images_of = inference(model.encoder)
         self.backbone = fold_batch_norms(model.backbone).to(dtype=self.dtype)
         heads = [cast(Head, head) for head in model.heads]
         # the score's branch of every class, and that of the IoU if there is one
@@ -106,12 +103,9 @@ class Detector:
                 self.graphs[key] = Graph(self, batch_size, capacity)
             return self.graphs[key](points, sample)
 
-    @torch.no_grad()
     def encode(self, points: Tensor, sample: Tensor, batch_size: int) -> list[Tensor]:
         """Pseudo-images, finest first, that hold until the next call."""
-        if self.fused is not None and self.is_fused(batch_size):
-            return self.fused(points, sample, batch_size, self.dtype)
-        return [image.to(self.dtype) for image in self.encoder(points, sample, batch_size)]
+        return self.images_of(points, sample, batch_size, self.dtype)
 
     def is_fused(self, batch_size: int) -> bool:
         """Whether the encoder runs as `FusedEncoder` for batches of this size."""

@@ -1,5 +1,6 @@
 """The encoder in inference: the same two steps as in training, with kernels that keep nothing for gradients."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -120,3 +121,19 @@ class FusedEncoder:
             image = torch.zeros(batch_size * grid.shape[0] * grid.shape[1], channels, dtype=dtype, device=device)
         self.written[key] = image, scale
         return image
+
+
+def inference(encoder: HybridVoxelEncoder | PillarEncoder) -> Callable[..., list[Tensor]]:
+    """How an encoder in evaluation mode runs in inference: as `FusedEncoder` where it can be one, else as it is.
+
+    The function returned has the arguments of FusedEncoder.__call__.
+    """
+    fused = FusedEncoder(encoder) if isinstance(encoder, HybridVoxelEncoder) and is_fused(encoder, 1) else None
+
+    @torch.no_grad()
+    def encode(points: Tensor, sample: Tensor, batch_size: int, dtype: torch.dtype = torch.float32) -> list[Tensor]:
+        if fused is not None and is_fused(encoder, batch_size):
+            return fused(points, sample, batch_size, dtype)
+        return [image.to(dtype) for image in encoder(points, sample, batch_size)]
+
+    return encode
