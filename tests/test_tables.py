@@ -26,14 +26,18 @@ def test_a_class_without_detections_has_one_line() -> None:
 
 def test_loose_overlaps_stand_where_they_differ(tmp_path: Path) -> None:
     """In the table, the curves and the plot; that of 2D boxes is the strict one."""
-    result = evaluate([rows("Tram 0 20 100 50")], [rows("Tram 0 20 100 50 score=0.5", scored=True)], classes=["Tram"])
+    result = evaluate(
+        [rows("Straßenbahn 0 20 100 50")],
+        [rows("Straßenbahn 0 20 100 50 score=0.5", scored=True)],
+        classes=["Straßenbahn"],
+    )
     lines = [line.split()[:2] for line in format_table(result).splitlines() if line[:3] in ("2d ", "bev", "3d ", "aos")]
     strict = [["2d", "0.70"], ["aos", "0.70"], ["bev", "0.70"], ["3d", "0.70"]]
     assert lines[:6] == [*strict, ["bev", "0.50"], ["3d", "0.50"]]
     write_csv(tmp_path / "a.csv", result)
-    with (tmp_path / "a.csv").open(newline="") as file:
+    with (tmp_path / "a.csv").open(newline="", encoding="utf-8") as file:
         curves = [(row["class"], row["metric"], row["overlap"]) for row in csv.DictReader(file)]
     expected = [("2d", "0.7"), ("bev", "0.7"), ("3d", "0.7"), ("bev", "0.5"), ("3d", "0.5")]
-    assert curves == [("Tram", *each) for each in expected for _ in range(3)]
+    assert curves == [("Straßenbahn", *each) for each in expected for _ in range(3)]
     plot(tmp_path / "a.png", result)
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")

@@ -63,7 +63,7 @@ def _frame_files(folder: Path, content: str) -> dict[str, Path]:
 
 def _read_frames(path: Path, label_files: dict[str, Path], label_dir: Path) -> list[str]:
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as text; it names the frames to score, one a line") from error
     seen: dict[str, int] = {}

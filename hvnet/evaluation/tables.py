@@ -80,7 +80,7 @@ def _figure(value: float | None) -> str:
 
 def write_csv(path: Path, result: dict[str, dict[str, Any]]) -> None:
     """Writes the precision-recall curves, one line for every point."""
-    with open(path, "w", newline="") as file:
+    with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(("class", "metric", "overlap", "level", "score", "recall", "precision", "orientation"))
         for name, strictness, metric, level, curve in _curves(result):
