@@ -245,16 +245,7 @@ PILLARS = {"vfe": "pillar", "feature_scales": (1.0,), "projection_scales": (1.0,
         ({"vfe": "plain"}, False),
         ({"point_limit": 4}, False),
         ({"feature_scales": (1.0, 1.5)}, False),  # they do not nest
-        (
-            {
-                "vfe": "pillar",
-                "feature_scales": (1.0,),
-                "projection_scales": (1.0,),
-                "point_limit": 4,
-                "voxel_limit": 9,
-            },
-            False,
-        ),
+        (PILLARS, False),
     ],
 )
 def test_which_encoders_are_fused(changes: dict[str, Any], fused: bool) -> None:

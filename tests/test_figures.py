@@ -10,14 +10,14 @@ import pytest
 import torch
 from PIL import Image
 
-from hvnet.cli import InputError
 from hvnet.data.kitti import read_frame
-from hvnet.detector import Detector, load
-from hvnet.figures import features_of, main
-from hvnet.model import load_checkpoint, model_from_checkpoint
+from hvnet.exceptions import InputError
+from hvnet.figures import main
+from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint
+from hvnet.network.detector import Detector, load
+from hvnet.pictures.features import features_of
+from tests.helpers import ROOT
 from tests.models import TINY, save_untrained
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="module")

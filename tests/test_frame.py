@@ -10,7 +10,8 @@ import pytest
 import torch
 from PIL import Image
 
-from hvnet.data.frame import IMAGE_SIZE, Frame, Objects, object_names
+from hvnet.boxes import EDGES, box_corners
+from hvnet.data.frame import IMAGE_SIZE, NEAR, Frame, Objects, object_names
 from hvnet.exceptions import InputError
 from tests.helpers import CAMERA
 
@@ -184,3 +185,72 @@ class Quick(Pair):
 def test_object_names() -> None:
     assert [object_names(Pair(), k) for k in range(2)] == [("cone",), None]
     assert [object_names(Quick(), k) for k in range(2)] == [["Truck"], None]
+
+
+# --- lines and faces in the image -------------------------------------------------------------------------------------
+
+WIDE = replace(CAMERA, p2=np.array([[500.0, 0, 500, 0], [0, 500, 200, 0], [0, 0, 1, 0]]), size=(1000, 400))
+"""A camera at the LiDAR: u = 500 - 500 y / x, v = 200 - 500 z / x."""
+FRONT = [0, 1, 5, 4]
+
+# begin and end in LiDAR axes, what is seen of the line in pixels
+LINES = {
+    "in the image": ((10, 0, 0), (10, 1, 0.5), ((500, 200), (450, 175))),
+    "behind the camera": ((-10, 0, 0), (-1, 0, 0), None),
+    "before the near plane": ((NEAR / 2, 0, 0), (-1, 0, 0), None),
+    "cut at the near plane": ((10, 0, 0.01), (-10, 0, 0.01), ((500, 199.5), (500, 150))),
+    "the other way round": ((-10, 0, 0.01), (10, 0, 0.01), ((500, 150), (500, 199.5))),
+    "cut at the top on its way behind": ((10, 0, 0), (-10, 0, 1), ((500, 200), (500, 0))),
+    "cut at the left": ((10, 0, 0), (10, 20, 0), ((500, 200), (0, 200))),
+    "cut at the right": ((10, 0, 0), (10, -20, 0), ((500, 200), (999, 200))),
+    "cut at the bottom": ((10, 0, 0), (10, 0, -20), ((500, 200), (500, 399))),
+    "cut on both sides": ((10, 20, 0), (10, -20, 0), ((0, 200), (999, 200))),
+    "beside the image": ((10, 20, 0), (10, 30, 0), None),
+    "past a corner": ((10, 12, 3), (10, 9, 6), None),
+    "beside the camera": ((5, 8, 0), (-5, 8, 0), None),
+}
+
+
+@pytest.mark.parametrize("case", LINES)
+def test_lines(case: str) -> None:
+    begin, end, expected = LINES[case]
+    lines, seen = WIDE.project_lines(np.array([begin], float), np.array([end], float))
+    assert seen.tolist() == [expected is not None]
+    np.testing.assert_allclose(lines, np.reshape(expected or [], (-1, 2, 2)), rtol=0, atol=1e-9)
+
+
+# corners in LiDAR axes, number of corners that are seen, and left, top, right, bottom in pixels
+POLYGONS = {
+    "in the image": ([(10, 1, -1), (10, -1, -1), (10, -1, 1), (10, 1, 1)], 4, (450, 150, 550, 250)),
+    "over the right border": ([(10, -8, -1), (10, -12, -1), (10, -12, 1), (10, -8, 1)], 4, (900, 150, 999, 250)),
+    "over a corner": ([(10, 8, 2), (10, 11, 2), (10, 8, 5)], 5, (0, 0, 100, 100)),
+    "larger than the image": ([(10, 90, -90), (10, -90, -90), (10, -90, 90), (10, 90, 90)], 4, (0, 0, 999, 399)),
+    "behind the camera": ([(-9, 1, -1), (-9, -1, -1), (-9, -1, 1), (-9, 1, 1)], 0, None),
+    "the road under the camera": ([(10, 1, -1), (10, -1, -1), (-10, -1, -1), (-10, 1, -1)], 4, (301, 250, 699, 399)),
+}
+
+
+@pytest.mark.parametrize("case", POLYGONS)
+def test_polygons(case: str) -> None:
+    corners, count, bounds = POLYGONS[case]
+    polygon = WIDE.project_polygon(np.array(corners, float))
+    assert len(polygon) == count
+    if bounds is not None:
+        np.testing.assert_allclose((*polygon.min(axis=0), *polygon.max(axis=0)), bounds, rtol=0, atol=1e-9)
+
+
+def test_the_2d_box_holds_what_is_drawn_of_a_box() -> None:
+    """Boxes of any place, size and heading: nothing of their edges and faces is outside their 2D box."""
+    generator = torch.Generator().manual_seed(0)
+    scale, shift = torch.tensor([40.0, 30, 6, 6, 6, 6, 6]), torch.tensor([-10.0, -15, -3, 0.1, 0.1, 0.1, 0])
+    boxes = (torch.rand(500, 7, generator=generator) * scale + shift).double()
+    corners = box_corners(boxes).numpy()
+    bbox, visible = WIDE.project_boxes(boxes.numpy())
+    assert 100 < visible.sum() < 500
+    for k in range(len(boxes)):
+        lines, _ = WIDE.project_lines(corners[k, EDGES[:, 0]], corners[k, EDGES[:, 1]])
+        face = WIDE.project_polygon(corners[k, FRONT])
+        drawn = np.concatenate((lines.reshape(-1, 2), face))
+        assert visible[k] or len(drawn) == 0
+        assert (drawn >= bbox[k, :2] - 1e-6).all()
+        assert (drawn <= bbox[k, 2:] + 1e-6).all()
