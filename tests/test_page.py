@@ -14,14 +14,16 @@ import pytest
 import torch
 from PIL import Image
 
-from hvnet.cli import InputError
 from hvnet.data.kitti import read_frame, read_split
-from hvnet.detector import load
-from hvnet.errors import describe, main
-from hvnet.mistakes import FALSE_POSITIVE, MISS, Mistake, find_mistakes, worst
+from hvnet.evaluation.mistakes import FALSE_POSITIVE, MISS, Mistake, find_mistakes, worst
+from hvnet.evaluation.rules import config_rules
+from hvnet.exceptions import InputError
+from hvnet.mistakes import main
+from hvnet.network.detector import load
+from hvnet.pictures.page import describe
+from tests.helpers import ROOT
 from tests.models import TINY, save_untrained
 
-ROOT = Path(__file__).resolve().parents[1]
 AVERAGES = {"R40": {"bev": [1.0, 2.0, 3.0], "3d": [0.0, 1.0, 2.0]}, "exact": {"bev": [1.0, 2.0, 3.0]}}
 METRICS = [
     {"epoch": 1, "step": 2, "loss": 2.0, "classification": 1.5, "localization": 0.5},
@@ -74,7 +76,7 @@ class Page(HTMLParser):
 def mistakes_of(run: Path, root: Path, min_score: float) -> list[Mistake]:
     detector = load(run / "checkpoint.pt", "cpu")
     frames = [read_frame(root, name) for name in read_split(root, "val")]
-    found = [find_mistakes(frame, detector(frame.points), detector.classes, min_score) for frame in frames]
+    found = [find_mistakes(frame, detector(frame.points), config_rules(detector.config), min_score) for frame in frames]
     return [each for of_frame in found for each in of_frame]
 
 
@@ -111,25 +113,27 @@ def test_a_page_of_pillars(pillars: Path, scenes: Path, tmp_path: Path) -> None:
     assert "0 false positives" in page.text
 
 
-def test_a_class_that_kitti_does_not_score_is_left_out(scenes: Path, tmp_path: Path) -> None:
+def test_any_class_has_mistakes(scenes: Path, tmp_path: Path) -> None:
+    """Vans, which KITTI does not score, at the overlap of the command or of the anchors' size."""
     van = ["augment.objects={}", "head.classes.Cyclist.name=Van"]
     few = ["head.score_threshold=0.0", "head.candidates=50", "head.detections=5"]
     save_untrained(tmp_path / "model.pt", [*TINY, *few, *van])
     given = [str(tmp_path / "model.pt"), "--data", str(scenes), "--min-score", "0", "--device", "cpu"]
     main([*given, "--out", str(tmp_path / "page.html")])
-    page = (tmp_path / "page.html").read_text()
-    assert "Pedestrian" in page
-    assert "Cyclist" not in page
-    others = ["head.classes.Car.name=Truck", "head.classes.Pedestrian.name=Person_sitting"]
-    save_untrained(tmp_path / "vans.pt", [*TINY, *van, *others])
-    with pytest.raises(InputError, match=r"vans\.pt: finds none of Car, Pedestrian, Cyclist"):
-        main([str(tmp_path / "vans.pt"), "--data", str(scenes), "--out", str(tmp_path / "other.html")])
+    page = Page((tmp_path / "page.html").read_text())
+    assert "Van detected" in page.text
+    assert "Cyclist" not in page.text
+    assert "Van BEV0.5" in page.text  # as small as the anchors of Cyclist
+    main([*given, "--out", str(tmp_path / "other.html"), "--overlap", "Van=0.7"])
+    assert "Van BEV0.7" in Page((tmp_path / "other.html").read_text()).text
+    with pytest.raises(InputError, match=r"--overlap Cyclist=0\.7: no class Cyclist; there are Car, Pedestrian, Van"):
+        main([*given, "--out", str(tmp_path / "third.html"), "--overlap", "Cyclist=0.7"])
 
 
 def test_nothing_comes_from_elsewhere(run: Path) -> None:
     """The page is written to the run's folder, and all that it shows is inside."""
     main([str(run), "--count", "1", "--device", "cpu"])
-    text = (run / "errors.html").read_text(encoding="utf-8")
+    text = (run / "mistakes.html").read_text(encoding="utf-8")
     page = Page(text)
     assert {tag for tag, _ in page.tags} & {"script", "link", "iframe", "object"} == set()
     assert "http" not in text
@@ -212,7 +216,7 @@ def test_options_that_mean_nothing(option: list[str], capsys: pytest.CaptureFixt
 
 
 def test_a_mistake_is_one_line() -> None:
-    command = [sys.executable, "-m", "hvnet.errors", "missing"]
+    command = [sys.executable, "-m", "hvnet.mistakes", "missing"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith("error: missing: no such run; give ")
