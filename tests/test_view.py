@@ -21,32 +21,29 @@ import pytest
 import torch
 from PIL import Image
 
-from hvnet.cli import InputError
 from hvnet.data.kitti import boxes_to_labels, write_labels
-from hvnet.detect import Source, find_sources
-from hvnet.detector import Detector, load
+from hvnet.data.sources import find_frames
+from hvnet.evaluation.mistakes import FALSE_POSITIVE, MISS, Mistake
+from hvnet.exceptions import InputError
 from hvnet.kernels.voxel import make_grid
-from hvnet.mistakes import FALSE_POSITIVE, MISS, Mistake
-from hvnet.model import Detections
-from hvnet.view import (
+from hvnet.network.detector import Detector, load
+from hvnet.network.model import Detections
+from hvnet.pictures.viewer import (
     Viewer,
-    above,
     box_lines,
     brighter,
     camera_for,
-    choose_data,
     ground_height,
-    main,
     mistake_line,
     norm_image,
     paragraph,
     points_per_voxel,
-    read_scene,
     shades,
     start_server,
 )
+from hvnet.view import choose_data, main
+from tests.helpers import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 SCORES = [0.9, 0.5, 0.1]
 
 
@@ -56,7 +53,7 @@ SCORES = [0.9, 0.5, 0.1]
 @pytest.mark.parametrize(("score", "kept"), [(0.0, [0, 1, 2]), (0.1, [0, 1, 2]), (0.5, [0, 1]), (0.51, [0]), (1, [])])
 def test_detections_are_filtered_by_score(score: float, kept: list[int]) -> None:
     found = Detections(torch.rand(3, 7), torch.tensor(SCORES, dtype=torch.float64), torch.tensor([2, 0, 1]))
-    for column, all_rows in zip(above(found, score), found, strict=True):
+    for column, all_rows in zip(found.select(found.scores >= score), found, strict=True):
         assert torch.equal(column, all_rows[kept])
 
 
@@ -130,7 +127,8 @@ def test_text_is_no_html() -> None:
     assert "a&lt;b&gt;.bin: bad<br>&amp;" in paragraph("a<b>.bin: bad", "&")
 
 
-def test_what_a_scene_holds(scenes: Path, tmp_path: Path) -> None:
+def test_what_a_frame_shows(serve: Callable[[Path], Viewer], scenes: Path, tmp_path: Path) -> None:
+    """Its image where there is one, its labels where there are some; what cannot be read is said."""
     root = tmp_path / "kitti"
     shutil.copytree(scenes / "training", root / "training")
     (root / "training" / "label_2" / "000001.txt").unlink()
@@ -138,32 +136,33 @@ def test_what_a_scene_holds(scenes: Path, tmp_path: Path) -> None:
     images.mkdir()
     Image.new("L", (30, 20)).save(images / "000000.png")
     (images / "000002.png").write_text("no image")
-    first, second, third = (Source(f"{k:06d}", root, "training") for k in range(3))
-    scene = read_scene(first)
-    assert scene.frame is not None
-    assert scene.image is not None
-    assert scene.image.shape == (20, 30, 3)
-    assert read_scene(second)[1:] == (None, None, [])
-    with pytest.raises(InputError, match=r"000002\.png"):
-        read_scene(third)
-    cloud = root / "training" / "velodyne" / "000000.bin"
-    scene = read_scene(Source("a", cloud, None))
-    assert len(scene.points) * 16 == cloud.stat().st_size
-    assert scene[1:] == (None, None, [])
+    viewer = serve(root)
+    assert viewer.camera.visible
+    assert viewer.picture.image.shape == (20, 30, 3)
+    assert viewer.frame.objects is not None
+    viewer.go(1)
+    assert not viewer.camera.visible
+    assert viewer.frame.objects is None
+    viewer.go(2)
+    assert "000002.png: not an image" in viewer.info.content
+    viewer = serve(root / "training" / "velodyne")
+    assert len(viewer.frame.points) * 16 == (root / "training" / "velodyne" / "000000.bin").stat().st_size
+    assert viewer.frame.objects is None
+    assert not viewer.camera.visible
 
 
-def test_a_scene_without_a_camera(scenes: Path, tmp_path: Path) -> None:
+def test_a_frame_without_a_camera(serve: Callable[[Path], Viewer], scenes: Path, tmp_path: Path) -> None:
     folder = tmp_path / "training"
     for name in ("velodyne", "label_2"):
         (folder / name).mkdir(parents=True)
     shutil.copy(scenes / "training" / "velodyne" / "000000.bin", folder / "velodyne")
     boxes = np.array([[-9.0, -3.0, -0.9, 0.8, 0.7, 1.7, -2.0]])
     write_labels(folder / "label_2" / "000000.txt", boxes_to_labels(boxes, ["Pedestrian"]))
-    scene = read_scene(Source("000000", tmp_path, "training"))
-    assert len(scene.points) * 16 == (folder / "velodyne" / "000000.bin").stat().st_size
-    assert scene.frame is not None
-    np.testing.assert_allclose(scene.frame.boxes.numpy(), boxes, atol=0.01)
-    assert scene.image is None
+    frame = serve(tmp_path).frame
+    assert len(frame.points) * 16 == (folder / "velodyne" / "000000.bin").stat().st_size
+    assert frame.objects is not None
+    np.testing.assert_allclose(frame.objects.boxes.numpy(), boxes, atol=0.01)
+    assert frame.camera is None
 
 
 # --- the command -----------------------------------------------------------------------------------------------------
@@ -236,7 +235,7 @@ def serve(detector: Detector) -> Iterator[Callable[[Path], Viewer]]:
 
     def start(path: Path) -> Viewer:
         servers.append(start_server("127.0.0.1", 0))
-        return Viewer(servers[-1], detector, find_sources([path], None))
+        return Viewer(servers[-1], detector, find_frames([path]))
 
     yield start
     for server in servers:
@@ -264,7 +263,7 @@ def test_the_slider_filters_boxes_and_names(viewer: Viewer) -> None:
         kept = int((scores >= viewer.score.value).sum())
         assert shown(viewer.info.content) == (kept, len(scores))
         names = [text for text, _ in viewer.texts if text.visible]
-        assert len(names) == kept + len(viewer.scene.frame.boxes)  # type: ignore[union-attr]
+        assert len(names) == kept + len(viewer.frame.boxes_of(["Car", "Pedestrian", "Cyclist", "Van"]))
     viewer.named.value = False
     assert not any(text.visible for text, _ in viewer.texts)
 
@@ -273,8 +272,8 @@ def test_frames_follow_each_other_round(viewer: Viewer) -> None:
     names = [f"{k:06d}" for k in range(6)]
     seen = []
     for _ in range(7):
-        assert viewer.scene.frame is not None
-        assert viewer.scene.frame.id == viewer.chooser.value
+        assert viewer.frame.objects is not None
+        assert viewer.frame.name == viewer.chooser.value
         seen.append(viewer.chooser.value)
         viewer.go(viewer.wanted + 1)
     assert seen == [*names, names[0]]
@@ -287,7 +286,7 @@ def test_all_colours_and_pseudo_images_can_be_drawn(viewer: Viewer) -> None:
     for colour in viewer.colour.options:
         viewer.colour.value = colour
         node: Any = scene.get_handle_by_name("/points")
-        assert node.colors.shape == viewer.scene.points[:, :3].shape
+        assert node.colors.shape == viewer.frame.points[:, :3].shape
         assert len(np.unique(node.colors, axis=0)) > 5
     assert scene.get_handle_by_name("/pseudo-image") is None
     sizes = []
@@ -304,7 +303,7 @@ def test_pillars_have_one_grid(pillars: Path, scenes: Path) -> None:
     pytest.importorskip("viser")
     server = start_server("127.0.0.1", 0)
     try:
-        viewer = Viewer(server, load(pillars, "cpu"), find_sources([scenes], None))
+        viewer = Viewer(server, load(pillars, "cpu"), find_frames([scenes]))
         assert viewer.colour.options[2:] == ("points in its 0.16 m voxel",)
         assert viewer.overlay.options[1:] == ("0.16 m",)
         viewer.colour.value, viewer.overlay.value = viewer.colour.options[2], viewer.overlay.options[1]
@@ -316,7 +315,7 @@ def test_pillars_have_one_grid(pillars: Path, scenes: Path) -> None:
 
 def test_the_worst_mistakes_are_listed_and_shown(viewer: Viewer) -> None:
     viewer.search()
-    assert "6 of 6 labelled frames searched at score 0.5" in viewer.progress.content
+    assert "6 of 6 frames searched at score 0.5" in viewer.progress.content
     for column, mistakes in zip(viewer.buttons, viewer.listed, strict=True):
         assert mistakes
         lines = [button.label for button in column if button.visible]
@@ -342,7 +341,7 @@ def test_a_frame_that_cannot_be_read_is_named_and_left_again(
     (tmp_path / "kitti" / "training" / "velodyne" / "000001.bin").write_bytes(bytes(15))
     viewer = serve(tmp_path / "kitti")
     viewer.search()
-    assert "6 of 6 labelled frames searched at score 0.5<br>1 cannot be read" in viewer.progress.content
+    assert "6 of 6 frames searched at score 0.5<br>1 cannot be read" in viewer.progress.content
     viewer.go(1)
     assert "000001.bin: 15 bytes" in viewer.info.content
     assert shown(viewer.info.content) == (0, 0)
@@ -353,6 +352,7 @@ def test_a_frame_that_cannot_be_read_is_named_and_left_again(
 def test_clouds_without_labels_have_no_mistakes(serve: Callable[[Path], Viewer], scenes: Path) -> None:
     viewer = serve(scenes / "training" / "velodyne")
     viewer.search()
+    assert not any(folder.visible for folder in viewer.folders)
     assert list(viewer.found) == [0]  # where nothing can be missed, nothing is searched
     assert "no mistakes are known" in viewer.progress.content
     assert viewer.listed == ([], [])

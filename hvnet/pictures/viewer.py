@@ -209,8 +209,7 @@ class Viewer:
                 except (InputError, OSError):  # the page says what is wrong where the frame is chosen
                     unread += 1
                 time.sleep(0.01)  # lets a callback that waits have the lock
-            labelled = index + 1 - unlabelled
-            searched = f"{labelled} labelled frames searched at score {SHOWN_SCORE}"
+            searched = f"{index + 1} of {len(self.frames)} frames searched at score {SHOWN_SCORE}"
             self.list_mistakes(searched, *([f"{unread} cannot be read"] if unread else []))
         if unlabelled == len(self.frames):
             self.progress.content = paragraph("no labels, so that no mistakes are known")
