@@ -21,6 +21,8 @@ TINY = [
     "backbone.layers=[2, 2, 2]",
     "backbone.fusion_channels=8",
 ]
+SMALL = [*TINY, "head.score_threshold=0.0", "head.candidates=50", "head.detections=5"]
+QUICK = ["train.bfloat16=false", "train.batch_size=2", "synthetic={train_frames: 4, val_frames: 2}"]
 SHORT = [
     *TINY,
     "head.score_threshold=0.001",

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,19 +16,23 @@ import pytest
 import torch
 from PIL import Image
 
-from hvnet import study
-from hvnet.cli import InputError
 from hvnet.config import load_config
-from hvnet.data.kitti import boxes_to_labels, read_frame, read_split, write_labels
-from hvnet.detector import Detector
-from hvnet.model import Detections, HVNet, load_checkpoint
-from hvnet.study import STUDIES, Outcome, Row, agreement, main, with_budget
-from tests.models import CONFIGS, TINY
+from hvnet.data.frame import Objects
+from hvnet.data.kitti import KittiFrames, boxes_to_labels, read_split_frames, write_labels
+from hvnet.exceptions import InputError
+from hvnet.network.checkpoint import load_checkpoint
+from hvnet.network.detector import Detector
+from hvnet.network.model import Detections, HVNet
+from hvnet.studies.catalogue import STUDIES, Row, Study
+from hvnet.studies.rows import Outcome, count_cars, score_in_range, with_budget
+from hvnet.studies.study import locked
+from hvnet.studies.tables import agreement, trained_table
+from hvnet.study import main
+from hvnet.training.run import Run
+from tests.models import CONFIGS, QUICK, SMALL
 
 CPU = torch.device("cpu")
 ROWS = [(name, row.name) for name, each in STUDIES.items() for row in each.rows]
-SMALL = [*TINY, "head.score_threshold=0.0", "head.candidates=50", "head.detections=5"]
-QUICK = ["train.bfloat16=false", "train.batch_size=2", "synthetic={train_frames: 4, val_frames: 2}"]
 
 
 @pytest.mark.parametrize(("name", "row"), ROWS, ids=lambda value: value)
@@ -37,16 +40,17 @@ def test_every_row_builds_trains_a_step_and_detects(name: str, row: str, scenes:
     config = load_config(CONFIGS / "studies" / name / f"{row}.yaml", SMALL)
     torch.manual_seed(0)
     model = HVNet(config).train()
-    frames = [read_frame(scenes, at) for at in read_split(scenes, "val")]
+    frames = list(read_split_frames(scenes, "val"))
     points = torch.cat([frame.points for frame in frames])
     sample = torch.repeat_interleave(torch.arange(2), torch.tensor([len(frame.points) for frame in frames]))
     classes = [entry.name for entry in config.head.classes]
     boxes, labels = [], []
     for frame in frames:
-        near = (frame.boxes[:, 0] < 25.6) & (frame.boxes[:, 1].abs() < 6.4)
-        known = [k for k, at in enumerate(frame.names) if at in classes and near[k]]
-        boxes.append(frame.boxes[known])
-        labels.append(torch.tensor([classes.index(frame.names[k]) for k in known]).long())
+        objects = frame.objects or Objects(torch.zeros(0, 7), [])
+        near = (objects.boxes[:, 0] < 25.6) & (objects.boxes[:, 1].abs() < 6.4)
+        known = [k for k, each in enumerate(objects.names) if each in classes and near[k]]
+        boxes.append(objects.boxes[known])
+        labels.append(torch.tensor([classes.index(objects.names[k]) for k in known]).long())
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-3)
     losses = []
     for _ in range(2):
@@ -141,41 +145,41 @@ def test_agreement_of_seeds() -> None:
 def test_score_counts_objects_in_range(scenes: Path, tmp_path: Path) -> None:
     """A detector that says what is labelled scores 100, also if it knows nothing of what lies beyond its range."""
     config = load_config(CONFIGS / "studies" / "base.yaml", ["encoder.point_range=[0, -12.8, -3, 15, 12.8, 2]"])
-    ids = read_split(scenes, "val")
-    frames = iter([read_frame(scenes, name) for name in ids] * 2)
+    frames = read_split_frames(scenes, "val")
+    known_objects = iter([frame.objects or Objects(torch.zeros(0, 7), []) for frame in frames] * 2)
     classes = ["Car", "Pedestrian", "Cyclist"]
 
-    def detector(miss: int) -> Callable[[torch.Tensor], Detections]:
+    def detector(miss: int) -> Detector:
         def detect(_: torch.Tensor) -> Detections:
-            frame = next(frames)
-            known = [k for k, name in enumerate(frame.names) if name in classes and frame.boxes[k, 0] < 15]
+            objects = next(known_objects)
+            known = [k for k, name in enumerate(objects.names) if name in classes and objects.boxes[k, 0] < 15]
             known = known[miss:]
-            labels = torch.tensor([classes.index(frame.names[k]) for k in known])
-            return Detections(frame.boxes[known], torch.full((len(known),), 0.9), labels)
+            labels = torch.tensor([classes.index(objects.names[k]) for k in known])
+            return Detections(objects.boxes[known], torch.full((len(known),), 0.9), labels)
 
         detect.config, detect.classes = config, classes  # type: ignore[attr-defined]
-        return detect
+        return detect  # type: ignore[return-value]
 
-    scores = study.score(detector(0), scenes, ids)  # type: ignore[arg-type]
+    scores = score_in_range(detector(0), frames)
     figures = [value for table in scores.values() for value in table["bev"] if value is not None]
     assert len(figures) > 3
     assert figures == pytest.approx([100.0] * len(figures))
-    worse = study.score(detector(2), scenes, ids)  # type: ignore[arg-type]
+    worse = score_in_range(detector(2), frames)
     assert sum(table["bev"][2] or 0.0 for table in worse.values()) < 290
-    cars = study.count_cars(config, scenes, ids)
-    assert 0 < cars < sum(frame.names.count("Car") for frame in (read_frame(scenes, name) for name in ids)) + 1
+    cars = count_cars(config, frames)
+    assert 0 < cars < sum(list(frames.object_names(k) or ()).count("Car") for k in range(len(frames))) + 1
     for folder in ("velodyne", "label_2"):
         shutil.copytree(scenes / "training" / folder, tmp_path / "training" / folder)
     boxes = np.array([[x, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0] for x in (5.0, 10.0, 20.0)])
-    write_labels(tmp_path / "training" / "label_2" / f"{ids[0]}.txt", boxes_to_labels(boxes, ["Car"] * 3))
-    assert study.count_cars(config, tmp_path, ids[:1]) == 2  # without a camera, one of three out of range
+    write_labels(tmp_path / "training" / "label_2" / f"{frames.names[0]}.txt", boxes_to_labels(boxes, ["Car"] * 3))
+    assert count_cars(config, KittiFrames(tmp_path, frames.names[:1])) == 2  # no camera, one of three out of range
 
 
 def test_every_seed_has_its_column() -> None:
     rows = (Row("a", "a"), Row("b", "b"))
     outcomes = [outcome("a", 0, 5.0), outcome("a", 1, 6.0), outcome("b", 1, 7.0)]
     times = {"a": (1.0, 1.0, 2.0), "b": (1.0, 1.0, 0.0)}
-    table = study.trained_table(study.Study("", "", rows), outcomes, times, {"a", "b"})
+    table = trained_table(Study("", "", rows), outcomes, times, {"a", "b"})
     assert table[0].startswith("| row | mAP | seed 0 | seed 1 | Car |")
     assert table[2].startswith("| a | 5.5 | 5.0 | 6.0 | 4.5 |")
     assert table[3].startswith("| b | 7.0 | - | 7.0 | 6.0 |")
@@ -208,13 +212,13 @@ def test_a_study_is_written_and_goes_on(
     main(arguments(tmp_path, "--data", str(scenes), "--budget", "steps=2", "--seeds", "1"))
     first = capsys.readouterr().out
     trained: list[Path] = []
-    real_train = study.train
+    real_train = Run.train
 
-    def train(config, root, out, *rest):  # type: ignore[no-untyped-def]
-        trained.append(out)
-        real_train(config, root, out, *rest)
+    def train(run: Run) -> None:
+        trained.append(run.out)
+        real_train(run)
 
-    monkeypatch.setattr(study, "train", train)
+    monkeypatch.setattr(Run, "train", train)
     main(arguments(tmp_path, "--data", str(scenes), "--budget", "steps=2", "--validate", str(scenes)))
     assert len(trained) == 2  # the second seed; what was there is scored on the further frames
     out = capsys.readouterr().out
@@ -301,7 +305,7 @@ def test_mistakes(given: list[str], message: str, tmp_path: Path) -> None:
 
 
 def test_one_study_at_a_time(tmp_path: Path) -> None:
-    with study.locked(tmp_path), pytest.raises(InputError, match="another study is at work there"):
+    with locked(tmp_path), pytest.raises(InputError, match="another study is at work there"):
         main(["speed", "--out", str(tmp_path)])
 
 

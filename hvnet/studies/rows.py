@@ -20,7 +20,7 @@ from hvnet.evaluation.precision import evaluate
 from hvnet.evaluation.scoring import labels_in_range, score
 from hvnet.exceptions import InputError
 from hvnet.kernels.voxel import make_grid
-from hvnet.network.detector import load
+from hvnet.network.detector import Detector, load
 from hvnet.network.devices import device_name
 from hvnet.network.model import HVNet
 from hvnet.network.pillars import hard_voxels
@@ -92,9 +92,9 @@ def dropped_share(config: Config, frames: Frames) -> float:
     return 1 - kept / max(1, whole)
 
 
-def score_in_range(checkpoint: Path, frames: Frames, device: torch.device) -> Scores:
+def score_in_range(detector: Detector, frames: Frames) -> Scores:
     """Exact BEV and 3D AP and AOS on labelled frames; objects outside of the detector's range do not count."""
-    result = score(load(checkpoint, str(device)), frames, in_range=True)
+    result = score(detector, frames, in_range=True)
     none: list[float | None] = [None] * 3  # of a measure that the labels do not allow
     return {name: {m: table["exact"].get(m, none) for m in MEASURES} for name, table in result.items()}
 
@@ -118,12 +118,12 @@ def run_row(
             "parameters": sum(weight.numel() for weight in HVNet(config).parameters()),
             "device": describe(device),
             "dropped": dropped_share(config, data.val),
-            "scores": score_in_range(checkpoint, data.val, device),
+            "scores": score_in_range(load(checkpoint, str(device)), data.val),
         }
         write_result(file, known)
     if real is not None and (known.get("real_root") != str(real.root) or "real_dropped" not in known):
         known |= {"real_root": str(real.root), "real_dropped": dropped_share(config, real)}
-        known |= {"real": score_in_range(checkpoint, real, device)}
+        known |= {"real": score_in_range(load(checkpoint, str(device)), real)}
         write_result(file, known)
     found = {key: known[key] for key in ("steps", "seconds", "parameters", "dropped", "scores")}
     of_real = {key: known[key] for key in ("real_dropped", "real")} if real is not None else {}

@@ -88,11 +88,6 @@ class Run:
             self.say(self.background)
         if ranks.rank() == 0:
             self.out.mkdir(parents=True, exist_ok=True)
-            if not resume:
-                self.save()  # a run that fails in its first epoch can go on
-            keep_metrics(self.out / "metrics.jsonl", self.progress.epoch)
-            if data.root is not None:
-                (self.out / "data.txt").write_text(f"{data.root.absolute()}\n", encoding="utf-8")
 
     def say(self, text: str, **options: Any) -> None:
         """Prints on the first rank."""
@@ -225,11 +220,8 @@ class Run:
 
         SIGTERM or SIGINT ends it after the step that is under way, saved, by raising Stopped.
         """
-        board = None
-        if ranks.rank() == 0:
-            board = SummaryWriter(str(self.out / "tensorboard"), purge_step=self.progress.epoch + 1)
         options = self.config.train
-        with caught_signals(self.signals), contextlib.closing(board) if board else contextlib.nullcontext():
+        with caught_signals(self.signals), self.files() as board:
             while self.progress.epoch < options.epochs:
                 number = self.progress.epoch + 1
                 losses = self.epoch()
@@ -251,6 +243,22 @@ class Run:
                 if ranks.all_reduce(stop).item() > 0 and number < options.epochs:
                     self.stop()
         self.say(f"checkpoint: {self.checkpoint}\npictures:   {self.out / 'pictures'}")
+
+    @contextlib.contextmanager
+    def files(self) -> Iterator[SummaryWriter | None]:
+        """The first rank's files, ready to be written to; inside, TensorBoard's are open."""
+        if ranks.rank() > 0:
+            yield None
+            return
+        if not self.checkpoint.is_file():
+            self.save()  # a run that fails in its first epoch can go on
+        keep_metrics(self.out / "metrics.jsonl", self.progress.epoch)
+        if self.data.root is not None:
+            (self.out / "data.txt").write_text(f"{self.data.root.absolute()}\n", encoding="utf-8")
+        with contextlib.closing(
+            SummaryWriter(str(self.out / "tensorboard"), purge_step=self.progress.epoch + 1)
+        ) as board:
+            yield board
 
     def stop(self) -> None:
         """Raises Stopped, on all ranks."""
