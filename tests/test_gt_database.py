@@ -1,6 +1,7 @@
 """The ground-truth database: built from frames, written, read, compared with the real one, and refused when broken."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -217,6 +218,19 @@ def test_frames_of_another_format(camera: Camera | None) -> None:
     assert not database.bbox_height.any()
     assert not database.occlusion.any()
     np.testing.assert_array_equal(database.box[0], [-20, -5, 0.5, 1, 1, 1, 0])
+
+
+def test_a_region_is_no_object_in_another_format_either() -> None:
+    class Regions(Scans):
+        def __getitem__(self, k: int) -> Frame:
+            frame = super().__getitem__(k)
+            assert frame.objects is not None
+            return replace(frame, objects=Objects(frame.objects.boxes, ["DontCare", "Truck"]))
+
+    database = build_database(Regions())
+    assert database.name.tolist() == ["Truck", "Truck"]
+    assert database.label_row.tolist() == [1, 1]
+    assert database.box[:, 0].tolist() == [10, 10]
 
 
 def test_a_frame_without_labels_is_named(root: Path) -> None:

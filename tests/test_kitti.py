@@ -511,12 +511,11 @@ def test_labels_of_a_frame_of_another_format() -> None:
 
 
 def test_no_minus_zero_without_a_camera(tmp_path: Path) -> None:
-    """Straight ahead, at the sensor's height, and at the sensor itself."""
-    boxes = np.array(
-        [[10.0, 0, 0.75, 4, 2, 1.5, -np.pi / 2], [0, 0, 0, 4, 2, 1.5, np.pi / 2], [-0.0] * 3 + [1] * 3 + [0]]
-    )
-    for scores in (None, np.ones(3)):
-        labels = boxes_to_labels(boxes, ["Car"] * 3, None, scores)
+    """Straight ahead and behind, at the sensor's height, and at the sensor itself."""
+    centres = [[10.0, 0, 0.75], [-9.0, 0, -1], [0, 0, 0], [-0.0, -0.0, -0.0], [-5.0, 0, 0.75]]
+    boxes = np.array([[*centre, 4, 2, 1.5, yaw] for centre in centres for yaw in (-np.pi / 2, 0, np.pi / 2)])
+    for scores in (None, np.ones(len(boxes))):
+        labels = boxes_to_labels(boxes, ["Car"] * len(boxes), None, scores)
         write_labels(tmp_path / "a.txt", labels)
         words = (tmp_path / "a.txt").read_text().split()
         assert not {"-0", "-0.00", "-0.0000"} & set(words)

@@ -297,6 +297,10 @@ def test_a_class_without_labels_goes_by_the_size_of_its_detections() -> None:
     assert bus["overlaps"]["strict"] == {"2d": 0.7, "bev": 0.7, "3d": 0.7}
     assert bus["counts"] == {"ground_truths": [0, 0, 0], "detections": 1, "frames": 1}
     assert bus["exact"]["3d"] == [None] * 3
+    small = rows("bus_2 0 20 100 50")
+    small.dimensions[:] = 2.0  # labels come first
+    (bus,) = evaluate([small], [detection], classes=["bus_2"]).values()
+    assert bus["overlaps"]["strict"]["3d"] == 0.5
     detection.dimensions[:] = -1  # without 3D boxes there is no size
     (bus,) = evaluate([nothing], [detection], classes=["bus_2"]).values()
     assert bus["overlaps"]["strict"]["2d"] == 0.5
