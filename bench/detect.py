@@ -23,11 +23,13 @@ import torch
 from timing import agree, parser, read_scene, start, synchronise, write_rows
 from torch import Tensor
 
-from hvnet.cli import InputError, run_command
+from hvnet.cli import run_command
 from hvnet.config import load_config
 from hvnet.data.clouds import read_cloud
-from hvnet.detector import SHIPPED, Detector
-from hvnet.model import HVNet, load_checkpoint, model_from_checkpoint
+from hvnet.exceptions import InputError
+from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint
+from hvnet.network.detector import SHIPPED, Detector
+from hvnet.network.model import HVNet
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 STAGES = ("read", "encode", "backbone", "heads", "decode", "NMS")
@@ -68,8 +70,8 @@ def time_stages(detector: Detector, files: list[Path]) -> dict[str, float]:
         points, sample = torch.cat(clouds).to(detector.device), samples(clouds).to(detector.device)
         images = timed("encode", lambda: detector.encode(points, sample, len(files)))
         levels = timed("backbone", lambda: detector.backbone(images))
-        levels, logits = timed("heads", lambda: detector.score(levels))
-        candidates = timed("decode", lambda: detector.candidates(levels, logits))
+        levels, scores = timed("heads", lambda: detector.score(levels))
+        candidates = timed("decode", lambda: detector.candidates(levels, scores))
         timed("NMS", lambda: detector.suppress(candidates))
     timed("detector", lambda: detector.batch(clouds))
     return times

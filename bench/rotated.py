@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from timing import Bench, Run, Work, agree, parser, peak_memory, skipped, start
 from torch import Tensor
 
-from hvnet.cli import InputError, run_command
+from hvnet.cli import run_command
+from hvnet.exceptions import InputError
 from hvnet.kernels import reference
 from hvnet.kernels.rotated import rotated_iou_bev, rotated_nms
 

@@ -21,10 +21,11 @@ import torch
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
-from hvnet.cli import InputError
 from hvnet.data.kitti import drop_non_finite, read_frame, read_points
-from hvnet.data.synthetic import Options, make_frame
-from hvnet.model import device_name
+from hvnet.data.scenes.files import make_frame
+from hvnet.data.scenes.street import Options
+from hvnet.exceptions import InputError
+from hvnet.network.devices import device_name
 
 RESULTS = Path(__file__).resolve().parent / "results"
 PACKAGES = ("torch", "warp-lang", "torch-scatter", "numba", "shapely")
@@ -105,8 +106,8 @@ class Bench:
         sys.stdout.flush()
         return rows
 
-    def write(self, csv_file: Path, json_file: Path | None) -> None:
-        """Writes every row with the machine's columns, and the same as JSON."""
+    def write(self, csv_file: Path | None, json_file: Path | None) -> None:
+        """Writes every row with the machine's columns, and the same as JSON, where a file is given."""
         rows = [
             {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in asdict(row).items()}
             for row in self.rows
@@ -161,8 +162,10 @@ def synchronise(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def write_rows(path: Path, rows: list[dict[str, object]], machine: dict[str, str | int | float]) -> None:
-    """Writes rows that have the same columns, each with the machine's."""
+def write_rows(path: Path | None, rows: list[dict[str, object]], machine: dict[str, str | int | float]) -> None:
+    """Writes rows that have the same columns, each with the machine's; nothing without a path."""
+    if path is None:
+        return
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [*rows[0], *machine])
@@ -246,18 +249,27 @@ def parser(name: str, doc: str | None, repeat: int) -> argparse.ArgumentParser:
     made.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     made.add_argument("--threads", type=int, default=1, help="torch's threads on the CPU (default: 1)")
     made.add_argument("--repeat", type=int, default=repeat, help=f"timed calls a provider (default: {repeat})")
-    made.add_argument("--csv", type=Path, help=f"default: bench/results/{name}.csv, on a GPU {name}_cuda.csv")
-    made.add_argument("--json", type=Path, help="the same rows as JSON")
+    target = made.add_mutually_exclusive_group()
+    target.add_argument(
+        "--csv", type=Path, metavar="FILE", help="write the rows there (default: they are only printed)"
+    )
+    target.add_argument(
+        "--save",
+        action="store_true",
+        help=f"write the rows to the tracked bench/results/{name}.csv, on a GPU to {name}_cuda.csv",
+    )
+    made.add_argument("--json", type=Path, metavar="FILE", help="write the rows there as JSON")
     return made
 
 
 def start(name: str, args: argparse.Namespace) -> Bench:
-    """Sets threads, measures the roofline and prints the machine."""
+    """Sets threads, measures the roofline and prints the machine; --save makes args.csv the tracked file."""
     if args.threads < 1 or args.repeat < 1:
         raise InputError(f"--threads and --repeat: want 1 or more, got {args.threads} and {args.repeat}")
     if args.device == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: torch sees no GPU here")
-    args.csv = args.csv or RESULTS / (f"{name}.csv" if args.device == "cpu" else f"{name}_cuda.csv")
+    if args.save:
+        args.csv = RESULTS / (f"{name}.csv" if args.device == "cpu" else f"{name}_cuda.csv")
     torch.set_num_threads(args.threads)
     torch.manual_seed(0)
     device = torch.device(args.device)

@@ -1,8 +1,8 @@
 """The encoder as a good PyTorch user writes it, the baseline of voxel_encode.py; none of this project's kernels.
 
 Dynamic voxelisation: cursors by tensor arithmetic, voxel numbers by torch.unique (or none: dense buffers over the whole
-grid), then scatter of torch or of torch_scatter. Weights have the names of hvnet.encoder's, so that its state loads.
-Below it is hard voxelisation, as PointPillars and SECOND have it.
+grid), then scatter of torch or of torch_scatter. Weights have the names of hvnet.network.encoder's, so that its
+state loads. Below it is hard voxelisation, as PointPillars and SECOND have it.
 """
 
 from collections.abc import Callable
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hvnet.config import EncoderConfig
-from hvnet.encoder import HybridVoxelEncoder
 from hvnet.kernels.voxel import Grid
+from hvnet.network.encoder import HybridVoxelEncoder
 
 try:
     import torch_scatter

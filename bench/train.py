@@ -1,87 +1,109 @@
 """Frames a second of training, and what fills the time: data, encoder, backbone and heads, loss, backward, optimiser.
 
-A step is that of `python -m hvnet.train`, stage by stage and synchronised, with ground-truth sampling from the scenes'
-own objects; the whole step is timed again without stops between the stages.
+It runs `hvnet.training.run.Run`, that of `python -m hvnet.train`, in a folder that is deleted afterwards. Every other
+step is stopped where a stage ends, and waits there for the device; the steps between are timed as a whole. "data" is
+what the loader lets the step wait for, and the way to the device; "backward" has the gradient's norm with it.
 """
 
-import argparse
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
 from timing import parser, start, synchronise, write_rows
 
-from hvnet.cli import InputError, run_command
-from hvnet.config import Config, load_config
-from hvnet.data.augment import objects_of
-from hvnet.data.kitti import read_split
-from hvnet.data.synthetic import generate
-from hvnet.model import HVNet
-from hvnet.train import Batch, TrainingFrames, collate, load_database
+from hvnet.cli import run_command
+from hvnet.config import load_config
+from hvnet.data.scenes.files import generate
+from hvnet.exceptions import InputError
+from hvnet.training.batches import Batch, EpochOrder, TrainingFrames, kitti_data
+from hvnet.training.run import Run, deterministic
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 STAGES = ("data", "encoder", "backbone and heads", "loss", "backward", "optimiser")
+WARM_UP = 2  # steps of either kind that are not timed
 
 
-def time_steps(config: Config, root: Path, device: torch.device, repeat: int) -> dict[str, list[float]]:
+class Clock:
+    """Seconds of every stage of a step, added up until the next begins; off, it costs a step nothing."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device, self.on = device, False
+        self.seconds: dict[str, float] = {}
+        self.last = 0.0
+
+    def begin(self) -> None:
+        """A step begins."""
+        synchronise(self.device)
+        self.seconds, self.last = dict.fromkeys(STAGES, 0.0), time.perf_counter()
+
+    def end(self, stage: str) -> None:
+        """A stage, or a part of it, ends here."""
+        if self.on:
+            synchronise(self.device)
+            now = time.perf_counter()
+            self.seconds[stage] += now - self.last
+            self.last = now
+
+
+def batches(run: Run) -> Iterator[Batch]:
+    """The run's batches, epoch after epoch."""
+    order = run.loader.batch_sampler
+    assert isinstance(order, EpochOrder)
+    while True:
+        for batch in run.loader:
+            if isinstance(batch, InputError):
+                raise batch
+            yield batch
+        order.epoch += 1
+
+
+def time_steps(run: Run, repeat: int) -> dict[str, list[float]]:
     """Seconds of every stage and of the whole step, `repeat` times."""
-    ids = read_split(root, config.train.train_split)
-    database = load_database(root, ids, [])
-    frames = TrainingFrames(root, ids, config, objects_of(database, device), device)
-    torch.manual_seed(0)
-    model = HVNet(config).to(device).train()
-    optimizer = torch.optim.Adam(model.parameters(), lr=1e-4)
+    frames = run.loader.dataset
+    assert isinstance(frames, TrainingFrames)
+    if run.config.train.workers == 0:
+        for k in range(len(run.data.train)):
+            frames.read(k)  # the files are read once, in the first epoch
     times: dict[str, list[float]] = {stage: [] for stage in (*STAGES, "step")}
+    clock, model, loss_of = Clock(run.device), run.model.train(), run.model.loss
 
-    def timed(stage: str, run: Callable[[], Any]) -> Any:
-        synchronise(device)
-        begin = time.perf_counter()
-        result = run()
-        synchronise(device)
-        times[stage].append(time.perf_counter() - begin)
-        return result
+    def timed_loss(*args: Any) -> dict[str, torch.Tensor]:
+        clock.end("backbone and heads")
+        terms = loss_of(*args)
+        clock.end("loss")
+        return terms
 
-    def data(turn: int) -> Batch:
-        count = config.train.batch_size
-        return collate([frames[turn, (turn * count + k) % len(ids)] for k in range(count)]).to(device)
-
-    def loss_of(batch: Batch, maps: Any) -> torch.Tensor:
-        return torch.stack(list(model.loss(maps, batch.boxes, batch.labels).values())).sum()
-
-    def update() -> None:
-        torch.nn.utils.clip_grad_norm_(model.parameters(), config.train.gradient_clip)
-        optimizer.step()
-        optimizer.zero_grad(set_to_none=True)
-
-    def stages(turn: int) -> None:
-        batch = timed("data", lambda: data(turn))
-        images = timed("encoder", lambda: model.encoder(batch.points, batch.sample, len(batch.boxes)))
-        maps = timed("backbone and heads", lambda: model.maps_of(images))
-        loss = timed("loss", lambda: loss_of(batch, maps))
-        timed("backward", loss.backward)
-        timed("optimiser", update)
-
-    def step(turn: int) -> None:
-        batch = data(turn)
-        loss_of(batch, model(batch.points, batch.sample, len(batch.boxes))).backward()
-        update()
-
-    for k in range(len(ids)):
-        frames.read(k)  # the files are read once, in the first epoch
-    for turn in range(repeat + 2):
-        stages(turn)
-        timed("step", lambda turn=turn: step(turn))
-    return {stage: seconds[2:] for stage, seconds in times.items()}  # two to warm up
+    model.encoder.register_forward_pre_hook(lambda *_: clock.end("data"))
+    model.encoder.register_forward_hook(lambda *_: clock.end("encoder"))
+    run.optimizer.register_step_pre_hook(lambda *_: clock.end("backward"))
+    stream = batches(run)
+    with deterministic(), mock.patch.object(model, "loss", timed_loss):
+        for turn in range(repeat + WARM_UP):
+            clock.on = True
+            clock.begin()
+            run.step(next(stream))
+            clock.end("optimiser")
+            clock.on = False
+            synchronise(run.device)
+            begin = time.perf_counter()
+            run.step(next(stream))
+            synchronise(run.device)
+            if turn >= WARM_UP:
+                times["step"].append(time.perf_counter() - begin)
+                for stage, seconds in clock.seconds.items():
+                    times[stage].append(seconds)
+    return times
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """The command."""
-    arguments: argparse.ArgumentParser = parser("train", __doc__, repeat=10)
+    arguments = parser("train", __doc__, repeat=10)
     arguments.add_argument("--data", type=Path, metavar="DIR", help="a KITTI root (default: scenes are generated)")
     arguments.add_argument("--configs", nargs="+", default=["compact"], choices=["compact", "demo", "hvnet"])
     arguments.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as of hvnet.train")
@@ -97,7 +119,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             config = load_config(CONFIGS / f"{name}.yaml", args.set)
             if not config.augment.objects:
                 raise InputError(f"{name}: augment.objects is empty; the benchmark wants ground-truth sampling")
-            times = time_steps(config, root, bench.device, args.repeat)
+            run = Run(config, kitti_data(root, config), Path(folder) / name, bench.device)
+            times = time_steps(run, args.repeat)
             batch = config.train.batch_size
             half = ", bfloat16" if config.train.bfloat16 else ""
             whole = sum(float(np.median(times[stage])) for stage in STAGES)

@@ -1,7 +1,8 @@
 """The encoder, stage by stage: cursors, index, knowledge, AVFE, AVFEO and the whole, against torch and torch_scatter.
 
-"forward" is inference: batch norm with its running statistics, no gradients. "forward + backward" is training: batch
-norm of the batch, gradients of all weights. Every case first checks that its providers give the same result.
+"forward" is inference: batch norm with its running statistics, no gradients; "hvnet" is the FusedEncoder of a detector,
+"hvnet, unfused" the encoder of training. "forward + backward" is training: batch norm of the batch, gradients of all
+weights. Every case first checks that its providers give the same result.
 """
 
 import copy
@@ -33,12 +34,14 @@ from torch_encoder import Ids, PillarEncoder, Scatter, TorchEncoder, library
 from torch_encoder import cursors as torch_cursors
 from torch_encoder import knowledge as torch_knowledge
 
-from hvnet.cli import InputError, run_command
+from hvnet.cli import run_command
 from hvnet.config import EncoderConfig
-from hvnet.encoder import FusedEncoder, HybridVoxelEncoder, folded, scale_of_points
-from hvnet.kernels.encode import add_of_voxels, encode_voxels, knowledge, project_voxels, scales_of, voxel_means
+from hvnet.exceptions import InputError
+from hvnet.kernels.encode import knowledge
 from hvnet.kernels.scatter import segment_mean, segments
 from hvnet.kernels.voxel import Grid, VoxelIndex, Voxels, cursors, hash_index, nested_index, voxel_index
+from hvnet.network.encoder import HybridVoxelEncoder, scale_of_points
+from hvnet.network.fused import FusedEncoder, inference
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -69,6 +72,10 @@ class Setting:
         """The same encoder by a library's scatter."""
         made = TorchEncoder(self.config, self.encoder, libraries()[name], self.dense.get(name, False))
         return made.train(training)
+
+    def fused(self) -> FusedEncoder:
+        """The same encoder as a detector runs it."""
+        return FusedEncoder(copy.deepcopy(self.encoder).eval())
 
 
 class Counts:
@@ -160,6 +167,44 @@ def bench_index(bench: Bench, points: Tensor, sample: Tensor, grids: list[Grid],
     bench.time(f"index, {len(grids)} scales, among others", providers, counts.index)
 
 
+def bench_first_step(bench: Bench, setting: Setting, inputs: Inputs, counts: Counts) -> None:
+    """All that an encoder does before AVFE; FusedEncoder has the means, of which the kernels make g."""
+    points, sample, batch_size = inputs
+    grids, fused = setting.grids, setting.fused()
+    order = nested_index(points, sample, grids).order
+
+    def fused_index() -> list[Tensor]:
+        indexed = fused.index(points, sample)
+        return [indexed.points, indexed.kept, *indexed.voxel, *indexed.means.values()]
+
+    def pick_fused(found: list[Tensor]) -> list[Tensor]:
+        kept = int(found[1])
+        back = order[:kept].argsort()
+        of_scales = zip(found[2 : 2 + len(grids)], found[2 + len(grids) :], strict=True)
+        return [knowledge(found[0][:kept], mean, voxel[:kept])[back, :8] for voxel, mean in of_scales]
+
+    def own_index() -> list[Tensor]:
+        index = voxel_index(points, sample, batch_size, grids)
+        kept = points[index.order]
+        of_scales = [scale_of_points(kept, voxels) for voxels in index.scales]
+        return [kept, index.order, *(part for scale in of_scales for part in (scale.segments.voxel, scale.mean))]
+
+    def pick_own(found: list[Tensor]) -> list[Tensor]:
+        kept, order, *of_scales = found
+        return [knowledge(kept, mean, voxel)[order.argsort(), :8] for voxel, mean in paired(of_scales)]
+
+    def twin_index(name: str) -> list[Tensor]:
+        twin = twins[name]
+        kept, ids = twin.index(points, sample, batch_size)
+        return [torch_knowledge(kept, ids[grid], twin.scatter) for grid in grids]
+
+    twins = {name: setting.twin(name, False) for name in libraries()}
+    runs = {"hvnet": Provider(fused_index, [], pick_fused), "hvnet, unfused": Provider(own_index, [], pick_own)}
+    runs |= {name: Provider(partial(twin_index, name), []) for name in twins}
+    work = Work(counts.index.bytes + counts.knowledge.bytes, counts.knowledge.operations)
+    compare(bench, f"index and knowledge, {len(grids)} scales", runs, work, training=False)
+
+
 def libraries() -> dict[str, Scatter]:
     """The scatter libraries that are installed."""
     found = {name: library(name) for name in ("torch_scatter", "torch")}
@@ -203,27 +248,39 @@ def trained(run: Callable[[], list[Tensor]], inputs: Sequence[Tensor], given: li
 
 
 class Stages(NamedTuple):
-    """AVFE and AVFEO by one provider: from points and what it knows of each voxel, and from M and maxima."""
+    """AVFE and AVFEO by one provider: the first gives M and maxima, the second makes the images of them."""
 
-    avfe: Callable[[], list[tuple[Tensor, Tensor]]]
-    avfeo: Callable[[list[tuple[Tensor, Tensor]]], list[Tensor]]
-    avfe_weights: list[nn.Parameter]
-    avfeo_weights: list[nn.Parameter]
-    pick: Callable[[list[Tensor]], list[Tensor]] = list  # the voxels in images
+    avfe: Callable[[], list[Tensor]]
+    avfeo: Callable[[list[Tensor]], list[Tensor]]
+    weights: tuple[list[nn.Parameter], list[nn.Parameter]] = ([], [])  # of either, where they are trained
+    pick_encoded: Callable[[list[Tensor]], list[Tensor]] = list  # M and maxima, scale after scale
+    pick_images: Callable[[list[Tensor]], list[Tensor]] = list  # the voxels in the images
+
+
+def weights_of(encoder: HybridVoxelEncoder | TorchEncoder) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
+    """The weights of AVFE and those of AVFEO."""
+    return list(encoder.avfe.parameters()), list(encoder.avfeo.parameters())
+
+
+def flat(encoded: list[tuple[Tensor, Tensor]]) -> list[Tensor]:
+    """M and maxima of all scales in one list."""
+    return [part for pair in encoded for part in pair]
+
+
+def paired(encoded: list[Tensor]) -> list[tuple[Tensor, Tensor]]:
+    """The inverse of `flat`."""
+    return list(zip(encoded[0::2], encoded[1::2], strict=True))
 
 
 def own_stages(setting: Setting, points: Tensor, voxels: dict[Grid, Voxels], training: bool) -> Stages:
-    """What HybridVoxelEncoder.forward does, in two parts."""
+    """The two steps of HybridVoxelEncoder."""
     encoder = copy.deepcopy(setting.encoder).train(training)
     scales = {grid: scale_of_points(points, at) for grid, at in voxels.items()}
-
-    def avfe() -> list[tuple[Tensor, Tensor]]:
-        return encoder.point_features(points, scales)
-
-    def avfeo(encoded: list[tuple[Tensor, Tensor]]) -> list[Tensor]:
-        return encoder.voxel_features(encoded, points, scales)
-
-    return Stages(avfe, avfeo, list(encoder.avfe.parameters()), list(encoder.avfeo.parameters()))
+    return Stages(
+        lambda: flat(encoder.point_features(points, scales)),
+        lambda encoded: encoder.voxel_features(paired(encoded), points, scales),
+        weights_of(encoder),
+    )
 
 
 def twin_stages(setting: Setting, name: str, points: Tensor, voxels: dict[Grid, Voxels], training: bool) -> Stages:
@@ -233,62 +290,42 @@ def twin_stages(setting: Setting, name: str, points: Tensor, voxels: dict[Grid, 
     given = {grid: torch_knowledge(points, ids[grid], scatter) for grid in voxels}
     of_features = [ids[grid] for grid in encoder.feature_grids]
 
-    def avfe() -> list[tuple[Tensor, Tensor]]:
-        return encoder.avfe(points, [given[grid] for grid in encoder.feature_grids], of_features, scatter)
+    def avfe() -> list[Tensor]:
+        return flat(encoder.avfe(points, [given[grid] for grid in encoder.feature_grids], of_features, scatter))
 
-    def avfeo(encoded: list[tuple[Tensor, Tensor]]) -> list[Tensor]:
-        context, at = encoder.context(encoded, of_features), encoder.projection_grids
-        made = encoder.avfeo(context, [given[grid] for grid in at], [ids[grid] for grid in at], scatter)
+    def avfeo(encoded: list[Tensor]) -> list[Tensor]:
+        context, grids = encoder.context(paired(encoded), of_features), encoder.projection_grids
+        made = encoder.avfeo(context, [given[grid] for grid in grids], [ids[grid] for grid in grids], scatter)
         return [maxima for _, maxima in made]
 
-    return Stages(avfe, avfeo, list(encoder.avfe.parameters()), list(encoder.avfeo.parameters()))
+    return Stages(avfe, avfeo, weights_of(encoder))
 
 
 def fused_stages(setting: Setting, points: Tensor, sample: Tensor) -> Stages:
-    """What FusedEncoder does, in two parts; the points stand in the index's order."""
-    encoder = copy.deepcopy(setting.encoder).eval()
-    avfe, avfeo, grids = encoder.avfe, encoder.avfeo, setting.grids
-    index = nested_index(points, sample, grids)
-    parts, kept, _ = scales_of(index)
-    scales = dict(zip(grids, parts, strict=True))
-    means = {grid: voxel_means(points, scale) for grid, scale in scales.items()}
-    count = avfe.features.weight.shape[0]
-    at = encoder.feature_grids
-    images = {
-        grid: points.new_zeros(grid.shape[0] * grid.shape[1], avfeo.features.weight.shape[0])
-        for grid in encoder.projection_grids
-    }
+    """The two steps of FusedEncoder; the points stand in the index's order."""
+    encoder = setting.fused()
+    indexed = encoder.index(points, sample)
+    feature_grids, projection_grids = setting.encoder.feature_grids, setting.encoder.projection_grids
+    voxels = {grid: int(scale.counts) for grid, scale in indexed.scales.items()}  # on a GPU arrays are longer
 
-    def encode() -> list[tuple[Tensor, Tensor]]:
-        weight = folded(avfe.features, avfe.features_norm, None)
-        features = torch.addmm(weight[-1], points, weight[:-1])
-        attention = folded(avfe.knowledge, avfe.knowledge_norm, None)
-        product = features.new_empty(len(points), len(at) * count)
-        maxima = [
-            encode_voxels(features, points, means[grid], attention, scales[grid], avfe.relu, product, t)
-            for t, grid in enumerate(at)
-        ]
-        return list(zip(product.split(count, dim=1), maxima, strict=True))
+    def avfe() -> list[Tensor]:
+        product, maxima = encoder.point_features(indexed)
+        return [product, *maxima]
 
-    def project(encoded: list[tuple[Tensor, Tensor]]) -> list[Tensor]:
-        weight = folded(avfeo.features, avfeo.features_norm, None)
-        halves = weight[:-1].chunk(2 * len(at))
-        product = encoded[0][0]._base  # the columns of one tensor, as encode made them
-        assert product is not None
-        context = torch.addmm(weight[-1], product, torch.cat(halves[0::2]))
-        of_voxels = context.new_empty(len(at), max(scales[grid].rows for grid in at), context.shape[1])
-        for t, ((_, values), half) in enumerate(zip(encoded, halves[1::2], strict=True)):
-            torch.mm(values, half, out=of_voxels[t, : len(values)])
-        add_of_voxels(context, of_voxels, index.voxel[: len(at)], kept)
-        attention = folded(avfeo.knowledge, avfeo.knowledge_norm, None)
-        for grid, image in images.items():
-            project_voxels(context, points, means[grid], attention, scales[grid], avfeo.relu, image)
-        return list(images.values())
+    def avfeo(encoded: list[Tensor]) -> list[Tensor]:
+        return encoder.voxel_features(encoded[0], encoded[1:], indexed, 1, torch.float32)
 
-    def pick(made: list[Tensor]) -> list[Tensor]:
-        return [image[scales[grid].cursor[: scales[grid].rows]] for grid, image in zip(images, made, strict=True)]
+    def pick_encoded(encoded: list[Tensor]) -> list[Tensor]:
+        product, *maxima = encoded
+        maxima = [values[: voxels[grid]] for values, grid in zip(maxima, feature_grids, strict=True)]
+        return flat(list(zip(product.chunk(len(maxima), dim=1), maxima, strict=True)))
 
-    return Stages(encode, project, [], [], pick)
+    def pick_images(images: list[Tensor]) -> list[Tensor]:
+        rows = [image.permute(0, 2, 3, 1).flatten(0, 2) for image in images]
+        cursor = [indexed.scales[grid].cursor[: voxels[grid]] for grid in projection_grids]
+        return [of_cells[at] for of_cells, at in zip(rows, cursor, strict=True)]
+
+    return Stages(avfe, avfeo, pick_encoded=pick_encoded, pick_images=pick_images)
 
 
 def bench_layers(bench: Bench, setting: Setting, points: Tensor, sample: Tensor, counts: Counts) -> None:
@@ -319,22 +356,16 @@ def bench_layers(bench: Bench, setting: Setting, points: Tensor, sample: Tensor,
             stages["hvnet"] = fused_stages(setting, points, sample)
         stages["hvnet" if training else "hvnet, unfused"] = own_stages(setting, points, voxels, training)
         stages |= {name: twin_stages(setting, name, points, voxels, training) for name in libraries()}
-        runs = {name: Provider(partial(flat, of.avfe), of.avfe_weights) for name, of in stages.items()}
+        runs = {name: Provider(of.avfe, of.weights[0], of.pick_encoded) for name, of in stages.items()}
         compare(bench, "AVFE", runs, counts.avfe, training)
         runs = {}
         for name, of in stages.items():
             with torch.no_grad():
                 encoded = of.avfe()
             if training:
-                encoded = [(product.requires_grad_(), maxima.requires_grad_()) for product, maxima in encoded]
-            inputs = [*of.avfeo_weights, *(part for pair in encoded for part in pair)]
-            runs[name] = Provider(partial(of.avfeo, encoded), inputs, of.pick)
+                encoded = [part.requires_grad_() for part in encoded]
+            runs[name] = Provider(partial(of.avfeo, encoded), [*of.weights[1], *encoded], of.pick_images)
         compare(bench, "AVFEO", runs, counts.avfeo, training)
-
-
-def flat(run: Callable[[], list[tuple[Tensor, Tensor]]]) -> list[Tensor]:
-    """M and maxima of all scales in one list."""
-    return [part for pair in run() for part in pair]
 
 
 def compiled(name: str, module: nn.Module, inputs: Inputs, training: bool) -> Encode | None:
@@ -380,7 +411,7 @@ def encoders(setting: Setting, inputs: Inputs, training: bool, compile: bool) ->
     if training:
         modules["hvnet"] = own
     else:
-        fused = FusedEncoder(own)
+        fused = setting.fused()
         if inputs[0].is_cuda:
             found["hvnet, CUDA graph"] = Provider(captured(fused, inputs), [])
         modules |= {"hvnet": fused, "hvnet, unfused": own}
@@ -477,7 +508,7 @@ def sweep(bench: Bench, cases: Sequence[tuple[int, str, Setting, Inputs]]) -> li
 def own_encoder(setting: Setting, training: bool) -> Encode:
     """What this project runs in inference or in training."""
     own = copy.deepcopy(setting.encoder).train(training)
-    return own if training else FusedEncoder(own)
+    return own if training else inference(own)
 
 
 def one_call(encode: Encode, inputs: Inputs, training: bool) -> None:
@@ -555,12 +586,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     arguments.add_argument("--no-compile", action="store_true", help="leave torch.compile out: it takes a minute")
     arguments.add_argument(
-        "--plot", type=Path, help="draw time and memory over points and scales, instead of the stages"
+        "--plot",
+        type=Path,
+        help="draw time and memory over points and scales, instead of the stages; --save is for voxel_encode_sweep",
     )
     args = arguments.parse_args(argv)
     if args.max_points is not None and args.max_points < 1000:
         raise InputError(f"--max-points: want 1000 or more, got {args.max_points}")
-    bench = start("voxel_encode", args)
+    bench = start("voxel_encode_sweep" if args.plot else "voxel_encode", args)
     config = EncoderConfig()
     scene = read_scene(args.points).to(bench.device)
     for name in {"torch_scatter"} - libraries().keys():
@@ -578,6 +611,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         counts = Counts(setting.encoder, len(points), index, setting.grids)
         choose(setting, inputs)
         bench_index(bench, points, sample, setting.grids, counts)
+        bench_first_step(bench, setting, inputs, counts)
         bench_layers(bench, setting, points, sample, counts)
         bench_encoder(bench, setting, inputs, counts, not args.no_compile)
     bench.write(args.csv, args.json)

@@ -1,4 +1,4 @@
-"""The benchmarks on tiny sizes: they compare their providers, write what they measured, and time nothing wrong."""
+"""The benchmarks on tiny sizes: they compare their providers, write only where they are told to, time nothing wrong."""
 
 import csv
 import json
@@ -6,12 +6,14 @@ import math
 import runpy
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "bench" / "results"
 MACHINE = {"device", "threads", "copy_gb_s", "product_gflop_s", "python", "torch", "warp-lang", "torch-scatter"}
 
 # script, arguments, and a provider that some case must have
@@ -22,10 +24,62 @@ SCRIPTS = [
 ]
 
 
-def bench(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+STAGES = [("detect", ["--configs", "demo", "--batch", "1", "2"]), ("train", ["--configs", "demo"])]
+
+
+def bench(script: str, *arguments: str, first: str = "") -> subprocess.CompletedProcess[str]:
+    """Runs a benchmark in a process, after some Python."""
+    code = f"import runpy, sys\nsys.path.insert(0, 'bench')\n{first}\n"
+    code += f"runpy.run_path('bench/{script}.py', run_name='__main__')"
     return subprocess.run(
-        [sys.executable, f"bench/{script}.py", *arguments], cwd=ROOT, capture_output=True, text=True, check=False
+        [sys.executable, "-c", code, *arguments], cwd=ROOT, capture_output=True, text=True, check=False
     )
+
+
+def saving_to(folder: Path) -> str:
+    return f"import pathlib, timing; timing.RESULTS = pathlib.Path({str(folder)!r})"
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(autouse=True)
+def tracked_results_stay() -> Iterator[None]:
+    """No test here may change bench/results."""
+    before = {path: path.read_bytes() for path in RESULTS.iterdir() if path.is_file()}
+    yield
+    assert {path: path.read_bytes() for path in RESULTS.iterdir() if path.is_file()} == before
+
+
+@pytest.mark.parametrize(("script", "arguments"), [*((name, given) for name, given, _ in SCRIPTS), *STAGES])
+def test_only_prints_unless_told(script: str, arguments: list[str], tmp_path: Path) -> None:
+    done = bench(script, *arguments, "--repeat", "1", first=saving_to(tmp_path))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "written" not in done.stdout
+    assert not list(tmp_path.iterdir())
+    assert max(map(len, done.stdout.splitlines()[1:])) <= 100
+
+
+def test_saves_when_told(tmp_path: Path) -> None:
+    arguments = next(arguments for name, arguments, _ in SCRIPTS if name == "rotated")
+    done = bench("rotated", *arguments, "--repeat", "1", "--save", first=saving_to(tmp_path))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert list(tmp_path.iterdir()) == [tmp_path / "rotated.csv"]
+    assert {row["provider"] for row in read_rows(tmp_path / "rotated.csv")} >= {"hvnet", "numba twin"}
+    both = bench("rotated", "--save", "--csv", str(tmp_path / "rows.csv"))
+    assert both.returncode == 2
+    assert "not allowed with" in both.stderr
+
+
+def test_help_says_where_rows_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "bench")
+    monkeypatch.setenv("COLUMNS", "200")
+    timing = runpy.run_path(str(ROOT / "bench" / "timing.py"))
+    text = timing["parser"]("scatter", "", 20).format_help()
+    assert "the tracked bench/results/scatter.csv, on a GPU to scatter_cuda.csv" in text
+    assert "(default: they are only printed)" in text
 
 
 @pytest.mark.parametrize(("script", "arguments", "provider"), SCRIPTS)
@@ -33,9 +87,7 @@ def test_measures_and_writes(script: str, arguments: list[str], provider: str, t
     files = tmp_path / "new" / "rows.csv", tmp_path / "rows.json"
     done = bench(script, *arguments, "--repeat", "2", "--csv", str(files[0]), "--json", str(files[1]))
     assert done.returncode == 0, done.stdout + done.stderr
-    assert max(map(len, done.stdout.splitlines()[1:])) <= 100 or str(tmp_path) in done.stdout
-    with files[0].open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_rows(files[0])
     assert set(rows[0]) >= MACHINE
     assert provider in {row["provider"] for row in rows}
     assert {row["threads"] for row in rows} == {"1"}
@@ -49,16 +101,27 @@ def test_measures_and_writes(script: str, arguments: list[str], provider: str, t
 
 
 def test_plot(tmp_path: Path) -> None:
-    files = tmp_path / "plot.png", tmp_path / "rows.csv"
-    done = bench(
-        "voxel_encode", "--max-points", "1000", "--repeat", "1", "--plot", str(files[0]), "--csv", str(files[1])
-    )
+    plot, saved = tmp_path / "plot.png", tmp_path / "saved"
+    arguments = ["--max-points", "1000", "--repeat", "1", "--plot", str(plot), "--save"]
+    done = bench("voxel_encode", *arguments, first=saving_to(saved))
     assert done.returncode == 0, done.stdout + done.stderr
-    assert files[0].read_bytes().startswith(b"\x89PNG")
-    with files[1].open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    assert [path.name for path in saved.iterdir()] == ["voxel_encode_sweep.csv"]  # not the file of the stages
+    rows = read_rows(saved / "voxel_encode_sweep.csv")
     assert {row["case"] for row in rows} >= {"1,000 points, forward", "5 scales, forward + backward"}
     assert all(float(row["peak_mb"]) > 0 for row in rows)
+
+
+# what is timed must be what ships: a mistake in either step of FusedEncoder is seen
+WRONG_STEP = """
+from hvnet.network.fused import FusedEncoder as m
+f = m.{step}
+def wrong(*given):
+    found = f(*given)
+    (found if isinstance(found, list) else found[1])[0].add_(1)
+    return found
+m.{step} = wrong
+"""
 
 
 @pytest.mark.parametrize(
@@ -70,17 +133,13 @@ def test_plot(tmp_path: Path) -> None:
         ),
         ("rotated", "import hvnet.kernels.rotated as m; f = m.rotated_nms; m.rotated_nms = lambda *a: f(*a)[1:]"),
         ("voxel_encode", "import hvnet.kernels.voxel as m; f = m.cursors; m.cursors = lambda *a: f(*a) + 1"),
+        *(("voxel_encode", WRONG_STEP.format(step=step)) for step in ("point_features", "voxel_features")),
     ],
 )
 def test_a_wrong_provider_is_not_timed(script: str, wrong: str, tmp_path: Path) -> None:
     arguments = next(arguments for name, arguments, _ in SCRIPTS if name == script)
     file = tmp_path / "rows.csv"
-    code = f"{wrong}\nimport runpy, sys\nsys.path.insert(0, 'bench')\n"
-    code += f"runpy.run_path('bench/{script}.py', run_name='__main__')"
-    done = subprocess.run(
-        [sys.executable, "-c", code, *arguments, "--repeat", "1", "--csv", str(file)],
-        cwd=ROOT, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    done = bench(script, *arguments, "--repeat", "1", "--csv", str(file), first=wrong)
     assert done.returncode == 1, done.stdout + done.stderr
     assert "no timing: " in done.stderr
     assert not file.exists()
@@ -110,8 +169,7 @@ def test_stages_of_the_detector(tmp_path: Path) -> None:
     file = tmp_path / "rows.csv"
     done = bench("detect", "--configs", "demo", "--batch", "1", "2", "--repeat", "2", "--csv", str(file))
     assert done.returncode == 0, done.stdout + done.stderr
-    with file.open(encoding="utf-8") as table:
-        rows = list(csv.DictReader(table))
+    rows = read_rows(file)
     stages = ["read", "encode", "backbone", "heads", "decode", "NMS", "detector", "plain model"]
     assert [row["stage"] for row in rows] == 2 * stages
     assert all(0 < float(row["p50_ms"]) <= float(row["p95_ms"]) for row in rows)
@@ -122,7 +180,6 @@ def test_stages_of_training(tmp_path: Path) -> None:
     done = bench("train", "--configs", "demo", "--repeat", "2", "--csv", str(file))
     assert done.returncode == 0, done.stdout + done.stderr
     assert "frames/s" in done.stdout
-    with file.open(encoding="utf-8") as table:
-        rows = {row["stage"]: float(row["p50_ms"]) for row in csv.DictReader(table)}
+    rows = {row["stage"]: float(row["p50_ms"]) for row in read_rows(file)}
     assert list(rows) == ["data", "encoder", "backbone and heads", "loss", "backward", "optimiser", "step"]
     assert 0.5 < rows.pop("step") / sum(rows.values()) < 1.5
