@@ -19,14 +19,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hvnet import detect, errors, figures, train
-from hvnet.cli import InputError
+from hvnet import detect, figures, mistakes, train
 from hvnet.config import config_to_dict, load_config
 from hvnet.data.kitti import read_frame, read_labels, read_split
-from hvnet.model import HVNet, save_checkpoint
-from hvnet.study import STUDIES
-from tests.test_layout import ROOT
-from tests.test_study import QUICK, SMALL
+from hvnet.exceptions import InputError
+from hvnet.network.checkpoint import save_checkpoint
+from hvnet.network.model import HVNet
+from hvnet.studies.catalogue import STUDIES
+from tests.helpers import ROOT
+from tests.models import QUICK, SMALL
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 COMMAND = re.compile(r"^(?:pip install [^&]*&& |/usr/bin/time .*? )?python -m hvnet\.(\S+)(.*?)(?:\s+#.*)?$")
@@ -140,7 +141,7 @@ def test_command(
         def interrupt(_: object) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("hvnet.view.Viewer.search", interrupt)  # the last but to wait for Ctrl-C
+        monkeypatch.setattr("hvnet.pictures.viewer.Viewer.search", interrupt)  # the last but to wait for Ctrl-C
         with pytest.raises(KeyboardInterrupt):
             main([*arguments, "--port", "8790"])
     else:
@@ -157,8 +158,9 @@ def test_own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     (code,) = re.findall(r"^```python\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
     exec(code, {"my_frames": [(points, boxes, ["Car", "Pedestrian"])] * 5})
     frame = read_frame(Path("mine"), "000004")
-    np.testing.assert_allclose(frame.boxes.numpy(), boxes, atol=0.01)
-    assert frame.names == ("Car", "Pedestrian")
+    assert frame.objects is not None
+    np.testing.assert_allclose(frame.objects.boxes.numpy(), boxes, atol=0.01)
+    assert frame.objects.names == ("Car", "Pedestrian")
     assert len(frame.points) == 500
     assert (len(read_split(Path("mine"), "train")), len(read_split(Path("mine"), "val"))) == (4, 1)
     given = ["--config", str(ROOT / "configs" / "compact.yaml"), "--data", "mine", "--out", "run", "--device", "cpu"]
@@ -166,8 +168,8 @@ def test_own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     train.main([*given, *SETTINGS, *(part for each in changes for part in ("--set", each))])
     scored = json.loads((tmp_path / "run" / "metrics.jsonl").read_text().splitlines()[-1])["validation"]
     assert scored["Car"]["exact"]["bev"][1] is not None
-    errors.main(["run", "--device", "cpu", "--min-score", "0"])
-    page = (tmp_path / "run" / "errors.html").read_text()
+    mistakes.main(["run", "--device", "cpu", "--min-score", "0"])
+    page = (tmp_path / "run" / "mistakes.html").read_text()
     assert "9.5 m away" in page  # the pedestrian behind
     with Image.open(BytesIO(b64decode(re.findall(r'class="crop".*?base64,([^"]+)"', page)[0]))) as crop:
         assert crop.width == pytest.approx(crop.height, rel=0.1)  # from above alone

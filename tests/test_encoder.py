@@ -5,7 +5,6 @@ import dataclasses
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -14,23 +13,9 @@ from torch import Tensor
 from hvnet.config import EncoderConfig
 from hvnet.data.kitti import read_frame
 from hvnet.kernels import reference
-from hvnet.kernels.voxel import Grid
 from hvnet.network.encoder import VFE, AttentiveVFE, HybridVoxelEncoder
-from hvnet.network.fused import FusedEncoder, inference, is_fused
-from hvnet.network.grids import projection_grids
-from hvnet.network.model import make_encoder
-
-# not square, so that a transpose of x and y would be seen
-SMALL = EncoderConfig(
-    point_range=(0.0, -3.2, -3.0, 12.8, 3.2, 2.0), voxel_size=(0.4, 0.4), feature_channels=8, image_channels=12
-)
-
-
-def cloud(count: int, seed: int = 0, samples: int = 2) -> tuple[Tensor, Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    low, high = torch.tensor([-1.0, -4.0, -3.5, 0.0]), torch.tensor([14.0, 4.0, 2.5, 1.0])
-    points = low + torch.rand(count, 4, generator=generator) * (high - low)
-    return points, torch.randint(samples, (count,), generator=generator).sort().values
+from hvnet.network.fused import inference
+from tests.encoders import SCALES, SMALL, cloud, restless
 
 
 def plain_norm(norm: torch.nn.BatchNorm1d, rows: Tensor, training: bool) -> Tensor:
@@ -84,26 +69,6 @@ def plain_encoder(
             image[cell // (n_l * n_w), :, (cell // n_w) % n_l, cell % n_w] = values[cell]  # Eq. 3
         images.append(image)
     return images
-
-
-def restless(encoder: HybridVoxelEncoder) -> HybridVoxelEncoder:
-    """With running statistics and weights that are not those of the start."""
-    for module in encoder.modules():
-        if isinstance(module, torch.nn.BatchNorm1d):
-            module.running_mean.normal_()
-            module.running_var.uniform_(0.5, 2)
-            torch.nn.init.normal_(module.weight)
-            torch.nn.init.normal_(module.bias)
-    return encoder
-
-
-SCALES = [
-    ((0.5, 1.0, 2.0), (1.0, 2.0, 4.0)),
-    ((1.0,), (1.0,)),
-    ((0.5, 1.0), (2.0,)),
-    ((0.25, 0.5, 1.0, 2.0, 4.0), (0.5, 1.0, 2.0, 4.0, 8.0)),
-    ((1.0, 1.5), (1.5, 3.0)),  # do not nest, and 0.6 m divides neither 12.8 nor 6.4 m
-]
 
 
 @pytest.mark.parametrize(("feature_scales", "projection_scales"), SCALES)
@@ -186,108 +151,6 @@ def test_same_bits_twice() -> None:
         sum(image.square().sum() for image in images).backward()
         results.append(images + [p.grad for p in encoder.parameters()])
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
-
-
-def test_projection_grids_are_padded_and_halved() -> None:
-    config = EncoderConfig(projection_scales=(1.5, 3.0, 6.0))  # 0.3 m: 213.33 cells
-    grids = projection_grids(config)
-    assert [grid.cells for grid in grids] == [(214, 214), (107, 107), (54, 54)]
-    assert [grid.shape for grid in grids] == [(216, 216), (108, 108), (54, 54)]
-    assert isinstance(grids[0], Grid)
-
-
-def trained(config: EncoderConfig) -> HybridVoxelEncoder:
-    """An encoder whose statistics and weights are not those of the start, in evaluation mode."""
-    torch.manual_seed(5)
-    return restless(HybridVoxelEncoder(config)).eval()
-
-
-@pytest.mark.parametrize(("feature_scales", "projection_scales"), SCALES)
-@pytest.mark.parametrize("relu", [True, False])
-def test_fused_encoder_gives_the_same_images(
-    feature_scales: tuple[float, ...], projection_scales: tuple[float, ...], relu: bool
-) -> None:
-    config = dataclasses.replace(
-        SMALL, feature_scales=feature_scales, projection_scales=projection_scales, attention_relu=relu
-    )
-    encoder = trained(config)
-    fused = inference(encoder)
-    # the second cloud must find no trace of the first, an empty one and one point leave nothing else
-    for points, sample in (cloud(400), cloud(100, seed=1), cloud(0), cloud(1, seed=4), cloud(400)):
-        with torch.no_grad():
-            expected = encoder(points, sample, 2)
-        for image, plain in zip(fused(points, sample, 2), expected, strict=True):
-            assert image.is_contiguous(memory_format=torch.channels_last)
-            torch.testing.assert_close(image, plain, rtol=1e-4, atol=1e-4)  # products of two sums in float32
-
-
-def test_the_two_steps_of_the_fused_encoder_give_its_images() -> None:
-    encoder = trained(SMALL)
-    fused, parts = FusedEncoder(encoder), FusedEncoder(encoder)
-    points, sample = cloud(300)
-    indexed = parts.index(points, sample)
-    product, maxima = parts.point_features(indexed)
-    with torch.no_grad():
-        images = parts.voxel_features(product, maxima, indexed, 2, torch.float32)
-    assert product.shape == (len(indexed.points), len(SMALL.feature_scales) * SMALL.feature_channels)
-    assert [len(values) for values in maxima] == [indexed.scales[grid].rows for grid in encoder.feature_grids]
-    for image, whole in zip(images, fused(points, sample, 2), strict=True):
-        assert torch.equal(image, whole)
-
-
-PILLARS = {"vfe": "pillar", "feature_scales": (1.0,), "projection_scales": (1.0,), "point_limit": 4, "voxel_limit": 9}
-
-
-@pytest.mark.parametrize(
-    ("changes", "fused"),
-    [
-        ({}, True),
-        ({"vfe": "plain"}, False),
-        ({"point_limit": 4}, False),
-        ({"feature_scales": (1.0, 1.5)}, False),  # they do not nest
-        (PILLARS, False),
-    ],
-)
-def test_which_encoders_are_fused(changes: dict[str, Any], fused: bool) -> None:
-    encoder = make_encoder(dataclasses.replace(SMALL, **changes))
-    assert is_fused(encoder, 1) is fused
-    assert not is_fused(encoder, 2**30)  # more cells than a key has bits
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_fused_encoder_in_half_precision(dtype: torch.dtype) -> None:
-    encoder = trained(SMALL)
-    points, sample = cloud(300)
-    with torch.no_grad():
-        expected = encoder(points, sample, 2)
-    for image, plain in zip(FusedEncoder(encoder)(points, sample, 2, dtype), expected, strict=True):
-        assert image.dtype == dtype
-        tolerance = torch.finfo(dtype).eps  # one rounding of the last step
-        torch.testing.assert_close(image.float(), plain, rtol=2 * tolerance, atol=tolerance)
-
-
-def test_fused_encoder_follows_the_weights() -> None:
-    encoder = trained(SMALL)
-    fused = FusedEncoder(encoder)
-    points, sample = cloud(300)
-    before = [image.clone() for image in fused(points, sample, 2)]
-    with torch.no_grad():
-        encoder.avfeo.features_norm.weight.mul_(2)
-        encoder.avfeo.features_norm.bias.mul_(2)
-    for image, old in zip(fused(points, sample, 2), before, strict=True):
-        torch.testing.assert_close(image, 2 * old)
-
-
-def test_fused_encoder_on_a_real_frame(kitti_root: Path) -> None:
-    encoder = trained(EncoderConfig())
-    points = read_frame(kitti_root, "000008").points
-    sample = torch.zeros(len(points), dtype=torch.int64)
-    with torch.no_grad():
-        expected = encoder(points, sample, 1)
-    for image, plain in zip(FusedEncoder(encoder)(points, sample, 1), expected, strict=True):
-        # coordinates up to 64 m go through sums that cancel: relative to the image's largest value
-        assert (image - plain).abs().max() <= 2e-6 * plain.abs().max()
-        assert torch.equal(image != 0, plain != 0)
 
 
 @pytest.mark.parametrize("projection_scales", [(1.0, 2.0, 4.0), (1.5, 3.0)])

@@ -7,13 +7,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from hvnet.config import LossConfig, load_config
+from hvnet.config import Config, LossConfig, load_config
 from hvnet.kernels.rotated import rotated_iou_bev
 from hvnet.network.anchors import assign_targets
 from hvnet.network.head import HeadMaps
-from hvnet.network.loss import class_loss, iou_pairs
+from hvnet.network.loss import class_loss, focal_loss, iou_pairs
 from hvnet.network.model import HVNet
-from tests.models import CONFIGS
+from tests.models import CONFIGS, some_points
 
 
 def box(x: float, y: float, l: float, w: float, yaw: float = 0.0) -> Tensor:
@@ -114,3 +114,37 @@ def test_learnt_weights_by_hand() -> None:
         s = model.log_variances[name]
         assert s.grad is not None
         assert s.grad.item() == pytest.approx(1 - math.exp(-0.5 * k) * terms[name].item(), rel=1e-4)
+
+
+def test_focal_loss_by_hand() -> None:
+    logits = torch.tensor([[0.0, math.log(3), -math.log(3), 5.0]])  # p = 1/2, 3/4, 1/4, ignored
+    positive = torch.tensor([[True, True, False, False]])
+    negative = torch.tensor([[False, False, True, False]])
+    expected = -0.25 * (0.5**2 * math.log(0.5) + 0.25**2 * math.log(0.75)) - 0.75 * 0.25**2 * math.log(0.75)
+    assert focal_loss(logits, positive, negative, 0.25, 2.0).item() == pytest.approx(expected, rel=1e-6)
+
+
+def test_class_loss_by_hand(demo: Config) -> None:
+    entry = dataclasses.replace(demo.head.classes[0], focal_gamma=0.0, focal_alpha=0.5)
+    anchors = torch.tensor([[0.0, 0, 0, 4, 2, 1.5, 0], [0.1, 0, 0, 4, 2, 1.5, 0], [50.0, 0, 0, 4, 2, 1.5, 0]])
+    targets = assign_targets(anchors, [torch.tensor([[0.0, 0, 0.3, 4, 2, 1.5, 0]])], 0.5, 0.35)
+    assert targets.positive.tolist() == [[True, True, False]]
+    maps = HeadMaps(torch.zeros(1, 3), torch.zeros(1, 3, 8), torch.zeros(1, 3, 2), torch.zeros(1, 3, 2))
+    terms = class_loss(maps, targets, entry, LossConfig())
+    assert terms["classification"].item() == pytest.approx(3 * 0.5 * math.log(2) / 2)
+    assert terms["localization"].item() == pytest.approx(4 * 0.5 * 0.1**2 / 2)  # four x offsets of -0.1 m
+    assert terms["vertical"].item() == pytest.approx(1.5 * 2 * 0.5 * 0.2**2 / 2)
+    assert terms["direction"].item() == pytest.approx(0.2 * math.log(2))
+    terms = class_loss(maps, targets, entry, LossConfig(beta=0.05))  # from 0.05 on linear
+    assert terms["localization"].item() == pytest.approx(4 * (0.1 - 0.025) / 2)
+    assert terms["vertical"].item() == pytest.approx(1.5 * 2 * (0.2 - 0.025) / 2)
+
+
+def test_loss_without_boxes_is_finite(demo: Config) -> None:
+    model = HVNet(demo)
+    maps = model(some_points(), torch.zeros(500, dtype=torch.int64), 1)
+    terms = model.loss(maps, [torch.zeros(0, 7)], [torch.zeros(0, dtype=torch.int64)])
+    loss = torch.stack(list(terms.values())).sum()
+    loss.backward()
+    assert loss.isfinite()
+    assert terms["localization"] == 0

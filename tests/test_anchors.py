@@ -1,0 +1,105 @@
+"""Anchors: where they are, boxes encoded against them, and their matching."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from hvnet.boxes import bev_corners
+from hvnet.config import Config
+from hvnet.kernels import reference
+from hvnet.network.anchors import assign_targets, decode, encode, make_anchors
+
+
+def random_boxes(count: int, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    low = torch.tensor([0.0, -30.0, -2.0, 0.3, 0.3, 0.5, -math.pi])
+    high = torch.tensor([64.0, 30.0, 1.0, 8.0, 3.0, 3.0, math.pi])
+    return low + torch.rand(count, 7, generator=generator) * (high - low)
+
+
+def test_anchors_stand_at_cell_centres(demo: Config) -> None:
+    entry = demo.head.classes[0]
+    anchors = make_anchors(demo, entry)
+    assert entry.level == 1
+    expected = torch.tensor([[0.4, -2.8], [0.4, -2.0], [1.2, -2.8]])  # of the cells (0, 0), (0, 1) and (1, 0) of 0.8 m
+    torch.testing.assert_close(anchors[[0, 4, 4 * 8], :2], expected)
+    torch.testing.assert_close(anchors[:4, 6], torch.tensor([0, math.pi / 4, math.pi / 2, 3 * math.pi / 4]))
+    assert (anchors[:, 2] == entry.anchor_z).all()
+
+
+def test_decode_is_the_inverse_of_encode() -> None:
+    boxes, anchors = random_boxes(10_000).double(), random_boxes(10_000, seed=1).double()
+    corners, vertical, direction = encode(boxes, anchors)
+    decoded = decode(corners, vertical, direction, anchors)
+    torch.testing.assert_close(decoded[:, :6], boxes[:, :6], rtol=0, atol=1e-9)
+    assert (torch.sin(decoded[:, 6] - boxes[:, 6]).abs() < 1e-9).all()
+    assert (torch.cos(decoded[:, 6] - boxes[:, 6]) > 0.999).all()
+    modulo_pi = decode(corners, vertical, None, anchors)
+    assert (torch.sin(modulo_pi[:, 6] - boxes[:, 6]).abs() < 1e-9).all()
+    assert (torch.cos(modulo_pi[:, 6] - anchors[:, 6]) > -1e-9).all()  # the half-turn nearer to the anchor
+    assert ((decoded[:, 6] >= -math.pi) & (decoded[:, 6] < math.pi)).all()
+
+
+def test_pose_is_inverted_and_by_hand() -> None:
+    """VoxelNet's residuals, of the half-turn that is nearer to the anchor."""
+    boxes, anchors = random_boxes(10_000).double(), random_boxes(10_000, seed=1).double()
+    location, vertical, direction = encode(boxes, anchors, "pose")
+    assert location.shape == (10_000, 5)
+    assert (location[:, 4].abs() <= math.pi / 2 + 1e-9).all()
+    decoded = decode(location, vertical, direction, anchors)
+    torch.testing.assert_close(decoded[:, :6], boxes[:, :6], rtol=0, atol=1e-9)
+    assert (torch.cos(decoded[:, 6] - boxes[:, 6]) > 1 - 1e-9).all()
+    anchor = torch.tensor([[10.0, 0.0, -1.0, 4.0, 3.0, 1.5, 0.0]])
+    box = torch.tensor([[11.0, 0.5, -1.0, 8.0, 3.0, 1.5, math.pi - 0.2]])
+    location, _, direction = encode(box, anchor, "pose")
+    torch.testing.assert_close(location, torch.tensor([[0.2, 0.1, math.log(2), 0.0, -0.2]]))
+    assert direction.tolist() == [1]
+
+
+def test_encode_by_hand() -> None:
+    anchor = torch.tensor([[10.0, 0.0, -1.0, 4.0, 2.0, 1.5, 0.0]])
+    box = torch.tensor([[11.0, 0.5, -0.7, 4.0, 2.0, 3.0, math.pi]])  # backwards: its front is the anchor's rear
+    corners, vertical, direction = encode(box, anchor)
+    torch.testing.assert_close(corners, torch.tensor([[1.0, 0.5] * 4]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(vertical, torch.tensor([[0.2, math.log(2)]]))
+    assert direction.tolist() == [1]
+    assert bev_corners(anchor)[0].tolist() == [[12, 1], [12, -1], [8, -1], [8, 1]]
+
+
+def test_assign_targets_by_hand() -> None:
+    anchors = torch.tensor([[x, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0] for x in (0.0, 1.0, 2.0, 10.0, 20.0)])
+    boxes = torch.tensor([[0.4, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], [13.9, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]])
+    # IoU with box 0, shifted by d: (4 - d) / (4 + d): 0.818, 0.739, 0.429, 0, 0; box 1 overlaps only anchor 3: 0.013
+    targets = assign_targets(anchors, [boxes, boxes[:0]], 0.75, 0.6)
+    assert targets.positive.tolist() == [[True, False, False, True, False], [False] * 5]
+    assert targets.negative.tolist() == [[False, False, True, False, True], [True] * 5]
+    torch.testing.assert_close(targets.location, torch.tensor([[0.4, 0.0] * 4, [3.9, 0.0] * 4]))
+
+
+def test_two_boxes_with_one_best_anchor() -> None:
+    anchors = torch.tensor([[0.0, 0, 0, 4, 2, 1.5, 0], [50.0, 0, 0, 4, 2, 1.5, 0]])
+    boxes = torch.tensor([[1.0, 0, 0, 4, 2, 1.5, 0], [0.5, 0, 0, 4, 2, 1.5, 0]])
+    targets = assign_targets(anchors, [boxes], 0.9, 0.3)
+    assert targets.positive.tolist() == [[True, False]]
+    torch.testing.assert_close(targets.location, torch.tensor([[1.0, 0.0] * 4]))
+
+
+def test_assign_targets_is_the_matrix_version(demo: Config) -> None:
+    entry = demo.head.classes[0]
+    anchors = make_anchors(demo, entry)
+    boxes = random_boxes(6)
+    boxes[:, :2] = torch.tensor([[2.0, 0.0], [4.0, 2.0], [8.0, -2.0], [10.0, 1.0], [6.0, 0.0], [11.0, -1.0]])
+    targets = assign_targets(anchors, [boxes[:4], boxes[4:]], 0.5, 0.35)
+    for b, own in enumerate((boxes[:4], boxes[4:])):
+        iou = reference.rotated_iou_bev(anchors.double(), own.double())
+        near = ((iou - 0.5).abs() < 1e-5).any(1) | ((iou - 0.35).abs() < 1e-5).any(1)
+        forced = iou == iou.amax(0)
+        positive = (iou.amax(1) > 0.5) | forced.any(1)
+        # anchors tied for the best of a box: only one of them is forced
+        tied = (iou > iou.amax(0) - 1e-6).any(1) & ~(iou.amax(1) > 0.5)
+        compared = ~near & ~tied
+        assert torch.equal(targets.positive[b][compared], positive[compared])
+        assert torch.equal(targets.negative[b][compared], (iou.amax(1) < 0.35)[compared])
+        for m in range(len(own)):
+            assert targets.positive[b][iou[:, m] > iou[:, m].amax() - 1e-6].any()
