@@ -1,0 +1,48 @@
+"""Which device a name means, and what is said where torch sees a GPU and Warp does not."""
+
+import re
+import warnings
+
+import pytest
+import torch
+import warp as wp
+
+import hvnet
+from hvnet.exceptions import InputError
+from hvnet.kernels.launch import cuda_problem
+from hvnet.kernels.rotated import rotated_iou_bev
+from hvnet.network.devices import device_name, select_device
+
+
+def test_names() -> None:
+    assert select_device("cpu") == torch.device("cpu")
+    assert device_name(torch.device("cpu"))
+    if not torch.cuda.is_available():
+        assert select_device("auto") == torch.device("cpu")
+        assert cuda_problem() is None
+        with pytest.raises(InputError, match=r"^device cuda: torch sees no CUDA device; use cpu$"):
+            hvnet.load(device="cuda")  # no word of an option that nobody typed
+
+
+@pytest.mark.parametrize("name", ["tpu", "", "cpu:x", "cuda:x"])
+def test_other_names_are_refused(name: str) -> None:
+    with pytest.raises(InputError, match=rf"^device {re.escape(name)}: "):
+        select_device(name)
+
+
+def test_a_gpu_that_warp_does_not_see(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One line that says what to do; `auto` goes on with the CPU."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(wp, "is_cuda_available", lambda: False)
+    problem = cuda_problem()
+    assert problem is not None
+    assert "driver of the 580 series or newer" in problem
+    assert "\n" not in problem
+    with pytest.warns(RuntimeWarning, match="580 series or newer; .*; going on with the CPU"):
+        assert select_device("auto") == torch.device("cpu")
+    with pytest.raises(InputError, match=r"^device cuda: torch sees a GPU, but Warp \S+ does not: "):
+        select_device("cuda")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert select_device("cpu") == torch.device("cpu")
+        assert rotated_iou_bev(torch.ones(1, 7), torch.ones(1, 7)).item() == 1
