@@ -12,16 +12,16 @@ from torch import Generator, Tensor
 from hvnet.boxes import bev_corners, boxes_collide, points_in_boxes
 from hvnet.config import AugmentConfig
 from hvnet.data.augment import (
-    Objects,
+    ObjectSampler,
     augment,
     mix_sectors,
-    objects_of,
     random_flip,
     random_rotation,
     random_scaling,
     random_translation,
     sample_frame,
     sample_objects,
+    sampler_of,
 )
 from hvnet.data.gt_database import Database, read_database
 from hvnet.data.kitti import read_frame
@@ -45,7 +45,7 @@ def scene(seed: int = 0) -> tuple[Tensor, Tensor]:
     return points, boxes
 
 
-def make_objects(objects: list[tuple[str, list[float]]], points_each: int = 10, **columns: list) -> Objects:
+def make_objects(objects: list[tuple[str, list[float]]], points_each: int = 10, **columns: list) -> ObjectSampler:
     """A database of objects (class, box) with `points_each` points along their middles."""
     count = len(objects)
     box = np.array([box for _, box in objects], dtype=np.float32).reshape(-1, 7)
@@ -66,10 +66,10 @@ def make_objects(objects: list[tuple[str, list[float]]], points_each: int = 10, 
         occlusion=np.array(arrays["occlusion"], dtype=np.int8),
         bbox_height=np.array(arrays["bbox_height"], dtype=np.float32),
     )
-    return objects_of(database, torch.device("cpu"))
+    return sampler_of(database, torch.device("cpu"))
 
 
-def points_of(objects: Objects, k: int) -> Tensor:
+def points_of(objects: ObjectSampler, k: int) -> Tensor:
     return objects.points[objects.database.offsets[k] : objects.database.offsets[k + 1]]
 
 
@@ -306,7 +306,7 @@ def test_mixing_with_an_empty_frame_leaves_a_side() -> None:
 
 
 def test_real_frame_with_the_real_database(kitti_root: Path) -> None:
-    database = objects_of(read_database(kitti_root / "gt_database.npz"), torch.device("cpu"))
+    database = sampler_of(read_database(kitti_root / "gt_database.npz"), torch.device("cpu"))
     frame = read_frame(kitti_root, "000008")
     assert frame.objects is not None
     own_boxes, names = frame.objects.boxes, frame.objects.names

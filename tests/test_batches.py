@@ -8,10 +8,12 @@ import torch
 from torch.utils.data import DataLoader
 
 from hvnet.config import Config
-from hvnet.data.augment import objects_of
+from hvnet.data.augment import sampler_of
 from hvnet.data.gt_database import load_database
 from hvnet.data.kitti import KittiFrames
-from hvnet.training.batches import EpochOrder, TrainingFrames, collate, seeded
+from hvnet.data.sources import JoinedFrames
+from hvnet.exceptions import InputError
+from hvnet.training.batches import EpochOrder, Sample, TrainingFrames, collate, seeded
 from tests.helpers import same
 
 CPU = torch.device("cpu")
@@ -19,7 +21,7 @@ IDS = ["000000", "000001", "000002"]
 
 
 def test_an_item_depends_on_seed_epoch_and_number_alone(scenes: Path, tiny: Config) -> None:
-    objects = objects_of(load_database(scenes, IDS, []), CPU)
+    objects = sampler_of(load_database(scenes, IDS, []), CPU)
 
     def frames(seed: int = 0) -> TrainingFrames:
         config = dataclasses.replace(tiny, train=dataclasses.replace(tiny.train, seed=seed))
@@ -89,6 +91,22 @@ def test_boxes_outside_the_range_and_other_classes_are_dropped(copied: Path, tin
     assert labels.tolist() == [0, 2]
     # the camera stands 0.27 m before the LiDAR, and its axes are turned by less than a degree
     torch.testing.assert_close(boxes[:, :2], torch.tensor([[10.3, 0.0], [9.3, -5.0]]), rtol=0, atol=0.2)
+
+
+def test_a_frame_without_labels_is_no_frame_of_background(scenes: Path, tiny: Config) -> None:
+    """It is a mistake or, where such frames are skipped, the next one takes its place."""
+    unlabelled = KittiFrames(scenes, IDS[:1], labelled=False)
+    frames = JoinedFrames([unlabelled, KittiFrames(scenes, IDS[1:])])
+    still = dataclasses.replace(tiny, augment=dataclasses.replace(tiny.augment, objects={}))
+    found = TrainingFrames(frames, still, None, CPU)[0, 0]
+    assert isinstance(found, InputError)
+    assert str(found) == "frame 000000: has no labels"
+    skipping = dataclasses.replace(still, train=dataclasses.replace(still.train, skip_corrupt=True))
+    sample = TrainingFrames(frames, skipping, None, CPU)[0, 0]
+    assert isinstance(sample, Sample)
+    assert (sample.name, sample.note) == ("000001", "frame 000000 is skipped: frame 000000: has no labels")
+    assert not isinstance(collate([sample, sample]), InputError)
+    assert collate([sample, found]) is found
 
 
 def test_batches_hold_whole_frames(scenes: Path, tiny: Config) -> None:

@@ -20,8 +20,8 @@ MIN_POINTS = 5
 """Objects of fewer points are not inserted, as in SECOND."""
 
 
-class Objects(NamedTuple):
-    """A ground-truth database that is ready for use."""
+class ObjectSampler(NamedTuple):
+    """A ground-truth database that is ready to draw from."""
 
     database: Database
     points: Tensor  # (M, 4) of all objects, on the device of the frames
@@ -29,7 +29,7 @@ class Objects(NamedTuple):
     of_frame: list[np.ndarray]  # rows of each frame that `sample_frame` inserts
 
 
-def objects_of(database: Database, device: torch.device) -> Objects:
+def sampler_of(database: Database, device: torch.device) -> ObjectSampler:
     """The database with its points on a device, and its rows by class and by frame."""
     has_points = np.diff(database.offsets) >= MIN_POINTS
     # rated by KITTI: easy, moderate or hard; SECOND leaves out the others. Without a camera there are no heights
@@ -39,14 +39,14 @@ def objects_of(database: Database, device: torch.device) -> Objects:
     by_frame = np.argsort(database.frame, kind="stable")
     _, starts = np.unique(database.frame[by_frame], return_index=True)
     of_frame = [rows[has_points[rows]] for rows in np.split(by_frame, starts[1:])]
-    return Objects(database, object_points(database).to(device), of_class, of_frame)
+    return ObjectSampler(database, object_points(database).to(device), of_class, of_frame)
 
 
 def augment(
     points: Tensor,
     boxes: Tensor,
     labels: Tensor,
-    objects: Objects | None,
+    objects: ObjectSampler | None,
     options: AugmentConfig,
     generator: Generator,
     classes: Sequence[str],
@@ -152,7 +152,7 @@ def sample_objects(
     points: Tensor,
     boxes: Tensor,
     labels: Tensor,
-    objects: Objects,
+    objects: ObjectSampler,
     counts: Mapping[str, int],
     generator: Generator,
     classes: Sequence[str],
@@ -175,7 +175,7 @@ def sample_objects(
 
 
 def sample_frame(
-    points: Tensor, boxes: Tensor, labels: Tensor, objects: Objects, generator: Generator, classes: Sequence[str]
+    points: Tensor, boxes: Tensor, labels: Tensor, objects: ObjectSampler, generator: Generator, classes: Sequence[str]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Inserts all objects of one frame of the database into points (N, 4), boxes (M, 7) and labels (M,).
 
@@ -187,7 +187,12 @@ def sample_frame(
 
 
 def _insert(
-    points: Tensor, boxes: Tensor, labels: Tensor, objects: Objects, drawn: np.ndarray, drawn_labels: Sequence[int]
+    points: Tensor,
+    boxes: Tensor,
+    labels: Tensor,
+    objects: ObjectSampler,
+    drawn: np.ndarray,
+    drawn_labels: Sequence[int],
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Inserts rows of the database, in this order, into a frame.
 

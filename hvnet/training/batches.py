@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from hvnet import ranks
 from hvnet.config import Config
-from hvnet.data.augment import Objects, augment, mix_sectors
+from hvnet.data.augment import ObjectSampler, augment, mix_sectors
 from hvnet.data.frame import Frame, Frames, object_names
 from hvnet.data.gt_database import Database, build_database, load_database
 from hvnet.data.kitti import read_split_frames
@@ -85,7 +85,7 @@ class TrainingFrames(Dataset[Sample | InputError]):
     A mistake in a file is returned, not raised: a worker process would wrap it in the text of its traceback.
     """
 
-    def __init__(self, frames: Frames, config: Config, objects: Objects | None, device: torch.device) -> None:
+    def __init__(self, frames: Frames, config: Config, objects: ObjectSampler | None, device: torch.device) -> None:
         self.frames, self.config, self.objects, self.device = frames, config, objects, device
         self.classes = [entry.name for entry in config.head.classes]
         self.kept: dict[int, Sample] = {}
@@ -123,6 +123,8 @@ class TrainingFrames(Dataset[Sample | InputError]):
         for at in [*range(k, len(self.frames)), *range(k)]:
             try:
                 frame = self.frames[at]
+                if frame.objects is None:
+                    raise InputError(f"frame {frame.name}: has no labels")
                 break
             except (InputError, OSError) as error:
                 if not self.config.train.skip_corrupt:
@@ -137,9 +139,10 @@ class TrainingFrames(Dataset[Sample | InputError]):
 
     def sample_of(self, frame: Frame, note: str) -> Sample:
         """The frame on the device, its classes by number."""
-        boxes, names = (torch.zeros(0, 7), ()) if frame.objects is None else (frame.objects.boxes, frame.objects.names)
-        labels = torch.tensor([self.classes.index(n) if n in self.classes else -1 for n in names]).long()
-        return Sample(frame.points.to(self.device), boxes, labels, note, frame.name)
+        assert frame.objects is not None
+        labels = [self.classes.index(name) if name in self.classes else -1 for name in frame.objects.names]
+        points = frame.points.to(self.device)
+        return Sample(points, frame.objects.boxes, torch.tensor(labels).long(), note, frame.name)
 
 
 class EpochOrder(Sampler[list[tuple[int, int]]]):

@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from hvnet import ranks
 from hvnet.config import Config, TrainConfig, config_from_dict, config_to_dict
-from hvnet.data.augment import objects_of
+from hvnet.data.augment import sampler_of
 from hvnet.evaluation.scoring import Detected, background_note, print_once, score
 from hvnet.evaluation.tables import format_table
 from hvnet.exceptions import InputError, Stopped
@@ -114,7 +114,7 @@ class Run:
         place = self.device if config.train.workers == 0 else torch.device("cpu")
         objects = None
         if config.augment.objects or config.augment.whole_frames:
-            objects = objects_of(training_objects(data, good, self.say), place)
+            objects = sampler_of(training_objects(data, good, self.say), place)
         return DataLoader(
             TrainingFrames(data.train, config, objects, place),
             batch_sampler=order,
