@@ -46,8 +46,8 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def copied(scenes: Path, tmp_path: Path) -> Path:
-    """Scenes that a test may change."""
-    return Path(shutil.copytree(scenes, tmp_path / "kitti"))
+    """Scenes that a test may change, without the database that another test may have left there."""
+    return Path(shutil.copytree(scenes, tmp_path / "kitti", ignore=shutil.ignore_patterns("gt_database.npz")))
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """The command that builds the ground-truth database of a KITTI root."""
 
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +12,8 @@ from hvnet.data.kitti import KittiFrames, read_split
 from hvnet.exceptions import InputError
 
 
-@pytest.fixture
-def root(scenes: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(scenes, tmp_path / "kitti"))
-
-
-def test_command(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command(copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = copied
     main(["--data", str(root)])
     path = root / "gt_database.npz"
     read, built = read_database(path), build_database(KittiFrames(root, read_split(root, "train"), crop=False))
