@@ -130,10 +130,14 @@ def test_a_run_leaves_torch_as_it_was(trained: Path, config: Config, tmp_path: P
     before = flags()
     run = Run(config, Data(MyFrames(range(2)), MyFrames(range(4, 5))), tmp_path / "run")
     assert flags() == before
-    losses = run.epoch()
-    assert losses["loss"] > 0
+    record = run.epoch()
     assert flags() == before
-    assert run.progress.step == 5
+    assert (record["epoch"], record["step"], run.progress[:3]) == (1, 5, (1, 0, 5))
+    assert record["loss"] > 0
+    assert set(record["validation"]) == set(CLASSES)
+    again = Run(config, Data(MyFrames(range(2)), MyFrames(range(4, 5))), tmp_path / "run", resume=True)
+    assert again.epoch()["epoch"] == 2
+    assert len((tmp_path / "run" / "metrics.jsonl").read_text().splitlines()) == 2
 
 
 def test_kitti_is_such_a_format(scenes: Path) -> None:

@@ -67,6 +67,8 @@ class Run:
             config = replace(config, train=replace(config.train, workers=0))
         self.config, self.data, self.out, self.device = config, data, Path(out), device
         self.checkpoint = self.out / "checkpoint.pt"
+        self.resumed = resume
+        self.board: SummaryWriter | None = None  # open in `train`
         self.signals: list[int] = []
         self.seen: set[str] = set()  # notes that were printed
         with deterministic():
@@ -88,6 +90,9 @@ class Run:
             self.say(self.background)
         if ranks.rank() == 0:
             self.out.mkdir(parents=True, exist_ok=True)
+            keep_metrics(self.out / "metrics.jsonl", self.progress.epoch)
+            if data.root is not None:
+                (self.out / "data.txt").write_text(f"{data.root.absolute()}\n", encoding="utf-8")
 
     def say(self, text: str, **options: Any) -> None:
         """Prints on the first rank."""
@@ -155,11 +160,30 @@ class Run:
                 buffer.copy_(statistics[name])
         return losses
 
-    def epoch(self) -> dict[str, float]:
-        """The rest of the epoch that is under way: the means of its losses. The run is then saved, before a validation.
+    def epoch(self) -> dict[str, Any]:
+        """The rest of the epoch that is under way, its validation if one is due, and its record, which is kept.
 
-        Raises Stopped, and has saved the run, if a signal comes.
+        The record holds `epoch`, `step`, the means of the losses and, after a validation, `validation`: by class and
+        measure (R40, exact) the AP. Raises Stopped, and has saved the run, if a signal comes.
         """
+        number = self.progress.epoch + 1
+        losses = self.run_batches()
+        parts = (f"{name} {value:.6f}" for name, value in losses.items())
+        self.say(f"epoch {number:3d}  " + "  ".join(parts), flush=True)
+        record: dict[str, Any] = {"epoch": number, "step": self.progress.step, **losses}
+        if number == self.config.train.epochs or number % self.config.train.validate_every == 0:
+            scores = self.validate()
+            self.say(format_table(scores), flush=True)
+            record["validation"] = {
+                name: {measure: table[measure] for measure in ("R40", "exact")} for name, table in scores.items()
+            }
+        self.write(record)
+        self.progress = Progress(number, 0, self.progress.step)
+        self.save()
+        return record
+
+    def run_batches(self) -> dict[str, float]:
+        """The rest of an epoch's batches: the means of its losses. The run is then saved, before a validation."""
         epoch, batches, step, sums = self.progress
         sums = dict(sums or {})
         order = self.loader.batch_sampler
@@ -220,45 +244,28 @@ class Run:
 
         SIGTERM or SIGINT ends it after the step that is under way, saved, by raising Stopped.
         """
-        options = self.config.train
-        with caught_signals(self.signals), self.files() as board:
-            while self.progress.epoch < options.epochs:
-                number = self.progress.epoch + 1
-                losses = self.epoch()
-                parts = (f"{name} {value:.6f}" for name, value in losses.items())
-                self.say(f"epoch {number:3d}  " + "  ".join(parts), flush=True)
-                record: dict[str, Any] = {"epoch": number, "step": self.progress.step, **losses}
-                if number == options.epochs or number % options.validate_every == 0:
-                    scores = self.validate()
-                    self.say(format_table(scores), flush=True)
-                    record["validation"] = {
-                        name: {measure: table[measure] for measure in ("R40", "exact")}
-                        for name, table in scores.items()
-                    }
-                if board:
-                    self.write(record, board)
-                self.progress = Progress(number, 0, self.progress.step)
-                self.save()
+        with caught_signals(self.signals), self.open_board():
+            if not self.resumed:
+                self.save()  # a run that fails in its first epoch can go on
+            while self.progress.epoch < self.config.train.epochs:
+                self.epoch()
                 stop = torch.full((), float(len(self.signals)), device=self.device)
-                if ranks.all_reduce(stop).item() > 0 and number < options.epochs:
+                if ranks.all_reduce(stop).item() > 0 and self.progress.epoch < self.config.train.epochs:
                     self.stop()
         self.say(f"checkpoint: {self.checkpoint}\npictures:   {self.out / 'pictures'}")
 
     @contextlib.contextmanager
-    def files(self) -> Iterator[SummaryWriter | None]:
-        """The first rank's files, ready to be written to; inside, TensorBoard's are open."""
+    def open_board(self) -> Iterator[None]:
+        """Inside, the first rank writes to TensorBoard's files as well."""
         if ranks.rank() > 0:
-            yield None
+            yield
             return
-        if not self.checkpoint.is_file():
-            self.save()  # a run that fails in its first epoch can go on
-        keep_metrics(self.out / "metrics.jsonl", self.progress.epoch)
-        if self.data.root is not None:
-            (self.out / "data.txt").write_text(f"{self.data.root.absolute()}\n", encoding="utf-8")
-        with contextlib.closing(
-            SummaryWriter(str(self.out / "tensorboard"), purge_step=self.progress.epoch + 1)
-        ) as board:
-            yield board
+        self.board = SummaryWriter(str(self.out / "tensorboard"), purge_step=self.progress.epoch + 1)
+        try:
+            yield
+        finally:
+            self.board.close()
+            self.board = None
 
     def stop(self) -> None:
         """Raises Stopped, on all ranks."""
@@ -268,11 +275,14 @@ class Run:
         )
         raise Stopped(message if ranks.rank() == 0 else "", self.signals[0] if self.signals else signal.SIGTERM)
 
-    def write(self, record: dict[str, Any], board: SummaryWriter) -> None:
-        """Adds an epoch to metrics.jsonl and to TensorBoard's files."""
-        for name, value in flatten(record):
-            board.add_scalar(name, value, record["epoch"])
-        board.flush()
+    def write(self, record: dict[str, Any]) -> None:
+        """Adds an epoch to metrics.jsonl and to TensorBoard's files, on the first rank."""
+        if ranks.rank() > 0:
+            return
+        if self.board is not None:
+            for name, value in flatten(record):
+                self.board.add_scalar(name, value, record["epoch"])
+            self.board.flush()
         with (self.out / "metrics.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(record) + "\n")
 
