@@ -159,9 +159,9 @@ def load_config(
 ) -> Config:
     """Reads a YAML file and applies overrides such as "train.epochs=3".
 
-    A file with a key `base`, the path of another file from its own folder, holds only the differences to that one. They
-    are laid over it: mappings key by key; over the list of classes goes a mapping by their names; null takes a key or
-    a class away. With `replace_base`, (file, other), the other takes the file's place among the bases.
+    A file with a key `base`, the path of another file relative to its own folder, holds only the differences to that
+    file. They are merged into it: mappings key by key, the list of classes by a mapping of their names; null removes a
+    key or a class. With `replace_base`, (file, other), the other takes the file's place among the bases.
 
     Raises InputError naming file and key.
     """
@@ -172,7 +172,7 @@ def load_config(
 
 
 def _read_chain(path: Path, replace_base: tuple[Path, Path] | None, seen: tuple[Path, ...]) -> dict[str, Any]:
-    """The tree of a file, laid over that of its base."""
+    """The tree of a file, merged into that of its base."""
     if replace_base is not None and path.resolve() == replace_base[0].resolve():
         return _read_chain(replace_base[1], None, ())
     if path.resolve() in seen:
@@ -196,7 +196,7 @@ def _read_chain(path: Path, replace_base: tuple[Path, Path] | None, seen: tuple[
 
 
 def _merge(below: Any, above: Any, source: str, key: str) -> Any:
-    """The value `above` laid over the value `below` of a dotted key."""
+    """The value `above` merged into the value `below` of a dotted key."""
     if not isinstance(above, dict):
         return above
     if isinstance(below, list) and all(isinstance(entry, dict) and "name" in entry for entry in below):
@@ -393,7 +393,8 @@ def _check(config: Config, source: str) -> None:
         want(0 <= entry.negative_iou <= entry.positive_iou, f"{key}.negative_iou",
              "between 0 and positive_iou", entry.negative_iou)  # fmt: skip
     for name, count in config.augment.objects.items():
-        want(name in names, f"augment.objects.{name}", f"a class of head.classes ({', '.join(names)})", name)
+        wanted = f"a class of head.classes ({', '.join(names)}; rename or remove it)"
+        want(name in names, f"augment.objects.{name}", wanted, name)
         want(count >= 0, f"augment.objects.{name}", "0 or more", count)
 
 

@@ -6,7 +6,6 @@ test set in its root (the readme of KITTI's object devkit), checked line by line
 
 import csv
 import math
-import textwrap
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -194,8 +193,8 @@ def main(arguments: Sequence[str] | None) -> None:
     if len(truths) == len(frames):  # all are labelled
         written = [read_labels(options.out / "results" / f"{name}.txt", scored=True) for name in frames.names]
         print(format_table(evaluate(truths, written, classes=detector.classes, rules=rules)) + "\n")
-        if note := background_note((str(name) for truth in truths for name in truth.name), detector.classes):
-            print(textwrap.fill(note, 100))
+    if note := background_note((str(name) for truth in truths for name in truth.name), detector.classes):
+        print(note)
     print(f"{total} boxes in {len(frames)} cloud{'s' * (len(frames) != 1)}")
     print(f"results:    {options.out / 'results'}\nboxes:      {options.out / 'boxes.csv'}")
     if options.pictures > 0:

@@ -6,11 +6,12 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from hvnet.cli import add_checkpoint, add_device, make_parser, run_command
+from hvnet.cli import add_checkpoint, add_device, add_overlaps, make_parser, read_overlaps, run_command
 from hvnet.data.clouds import SUFFIXES
 from hvnet.data.scenes.files import generate
 from hvnet.data.scenes.street import Options
 from hvnet.data.sources import find_frames
+from hvnet.evaluation.rules import config_rules
 from hvnet.exceptions import InputError
 from hvnet.network.detector import load
 from hvnet.pictures.viewer import Viewer, start_server
@@ -59,6 +60,7 @@ def main(arguments: Sequence[str] | None) -> None:
     parser.add_argument("--split", metavar="NAME", help="frames of ImageSets/NAME.txt of a KITTI root (default: all)")
     parser.add_argument("--port", type=int, default=8080, metavar="N", help="or the next that is free (default: 8080)")
     parser.add_argument("--host", default="127.0.0.1", metavar="NAME", help="address to listen at (default: 127.0.0.1)")
+    add_overlaps(parser)
     add_device(parser)
     options = parser.parse_args(arguments)
 
@@ -72,9 +74,10 @@ def main(arguments: Sequence[str] | None) -> None:
             distance = (4.0, min(detector.config.encoder.point_range[3] - 2, 80.0))
             generate(data, 0, DEMO_FRAMES, seed=1, options=Options(distance=distance))
         frames = find_frames([data], options.split)
+        rules = config_rules(detector.config, read_overlaps(options.overlap, detector.classes))
         server = start_server(options.host, options.port)
         try:
-            viewer = Viewer(server, detector, frames)
+            viewer = Viewer(server, detector, frames, rules)
             print(f"http://{options.host}:{server.get_port()}  (Ctrl-C ends it)", flush=True)
             viewer.search()
             threading.Event().wait()

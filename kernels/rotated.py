@@ -311,7 +311,7 @@ def _check_pair(a: Tensor, b: Tensor, name_a: str = "a", name_b: str = "b", colu
 def _check_scored(boxes: Tensor, scores: Tensor, iou_threshold: float, columns: int) -> None:
     check_tensor("boxes", boxes, FLOATS, (None, columns))
     check_tensor("scores", scores, FLOATS, (boxes.shape[0],), like=boxes)
-    if not isinstance(iou_threshold, Real):
+    if not isinstance(iou_threshold, Real) or isinstance(iou_threshold, bool):
         raise TypeError(f"iou_threshold: want a number, got {type(iou_threshold).__name__}")
 
 

@@ -1,6 +1,5 @@
 """Fixtures for all tests: unwritten memory is seen, the real KITTI frames are found or skipped."""
 
-import os
 import shutil
 from pathlib import Path
 
@@ -12,13 +11,12 @@ from hvnet.data.scenes.files import generate
 from hvnet.data.scenes.street import Options
 from hvnet.network.checkpoint import save_checkpoint
 from hvnet.network.model import HVNet
+from tests.helpers import SHARED
 from tests.models import CONFIGS, NARROW, SHORT
 
 torch.utils.deterministic.fill_uninitialized_memory = True
 torch.use_deterministic_algorithms(True)  # with it, torch.empty is filled with NaN or the largest integer
 torch.set_num_threads(1)  # the networks here are small: threads cost more than they save where others use the cores
-
-SHARED = Path(os.environ.get("HVNET_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ from hvnet.kernels import reference
 from hvnet.network.anchors import assign_targets, decode, encode, make_anchors
 
 
-def random_boxes(count: int, seed: int = 0) -> Tensor:
+def any_boxes(count: int, seed: int = 0) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     low = torch.tensor([0.0, -30.0, -2.0, 0.3, 0.3, 0.5, -math.pi])
     high = torch.tensor([64.0, 30.0, 1.0, 8.0, 3.0, 3.0, math.pi])
@@ -29,7 +29,7 @@ def test_anchors_stand_at_cell_centres(demo: Config) -> None:
 
 
 def test_decode_is_the_inverse_of_encode() -> None:
-    boxes, anchors = random_boxes(10_000).double(), random_boxes(10_000, seed=1).double()
+    boxes, anchors = any_boxes(10_000).double(), any_boxes(10_000, seed=1).double()
     corners, vertical, direction = encode(boxes, anchors)
     decoded = decode(corners, vertical, direction, anchors)
     torch.testing.assert_close(decoded[:, :6], boxes[:, :6], rtol=0, atol=1e-9)
@@ -43,7 +43,7 @@ def test_decode_is_the_inverse_of_encode() -> None:
 
 def test_pose_is_inverted_and_by_hand() -> None:
     """VoxelNet's residuals, of the half-turn that is nearer to the anchor."""
-    boxes, anchors = random_boxes(10_000).double(), random_boxes(10_000, seed=1).double()
+    boxes, anchors = any_boxes(10_000).double(), any_boxes(10_000, seed=1).double()
     location, vertical, direction = encode(boxes, anchors, "pose")
     assert location.shape == (10_000, 5)
     assert (location[:, 4].abs() <= math.pi / 2 + 1e-9).all()
@@ -88,7 +88,7 @@ def test_two_boxes_with_one_best_anchor() -> None:
 def test_assign_targets_is_the_matrix_version(demo: Config) -> None:
     entry = demo.head.classes[0]
     anchors = make_anchors(demo, entry)
-    boxes = random_boxes(6)
+    boxes = any_boxes(6)
     boxes[:, :2] = torch.tensor([[2.0, 0.0], [4.0, 2.0], [8.0, -2.0], [10.0, 1.0], [6.0, 0.0], [11.0, -1.0]])
     targets = assign_targets(anchors, [boxes[:4], boxes[4:]], 0.5, 0.35)
     for b, own in enumerate((boxes[:4], boxes[4:])):

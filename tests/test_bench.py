@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 import torch
 
-ROOT = Path(__file__).resolve().parents[1]
+from tests.helpers import ROOT
+
 RESULTS = ROOT / "bench" / "results"
 MACHINE = {"device", "threads", "copy_gb_s", "product_gflop_s", "python", "torch", "warp-lang", "torch-scatter"}
 

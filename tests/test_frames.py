@@ -1,8 +1,11 @@
 """A data format of one's own, and classes of one's own: a class of a few lines trains, detects, is scored and drawn."""
 
 import json
+import signal
+import threading
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,12 +16,13 @@ from hvnet.config import Config, load_config
 from hvnet.data.frame import Frame, Objects
 from hvnet.data.kitti import KittiFrames, boxes_to_labels, frame_labels, write_labels
 from hvnet.evaluation.scoring import score
+from hvnet.exceptions import InputError, Stopped
 from hvnet.network.detector import load
 from hvnet.pictures.clouds import Subject, draw_bev
 from hvnet.pictures.page import make_page
 from hvnet.training.batches import Data
 from hvnet.training.run import Run
-from tests.helpers import ROOT
+from tests.helpers import ROOT, contents
 from tests.models import TINY
 
 CLASSES = {"Truck": [7.0, 2.5, 3.0], "bicycle": [1.7, 0.6, 1.5]}
@@ -116,6 +120,81 @@ def test_its_files_are_scored_by_the_command(trained: Path, tmp_path: Path, caps
     evaluate.main(given)  # all classes are named by the labels and the results alone
     titles = {line.partition(" ")[0] for line in capsys.readouterr().out.splitlines()}
     assert titles >= {"Truck:", "bicycle:", "cone:"}
+
+
+class Wrong(MyFrames):
+    """The same with a mistake in the second frame."""
+
+    def __init__(self, mistake: dict[str, Any]) -> None:
+        super().__init__(range(3))
+        self.mistake = mistake
+
+    def __getitem__(self, k: int) -> Frame:
+        frame = super().__getitem__(k)
+        assert frame.objects is not None
+        given = {"points": frame.points, "boxes": frame.objects.boxes, "names": frame.objects.names}
+        given |= self.mistake if k == 1 else {}
+        return Frame(frame.name, given["points"], Objects(given["boxes"], given["names"]))
+
+
+@pytest.mark.parametrize(
+    ("mistake", "message"),
+    [
+        ({"points": np.zeros((5, 3))}, r"points: want shape \(N, 4\)"),
+        ({"boxes": np.zeros((3, 8))}, r"boxes: want shape \(M, 7\)"),
+        ({"boxes": np.full((3, 7), np.nan)}, r"boxes: want finite numbers and sizes of 0 or more, row 0 is \[nan"),
+        ({"boxes": [[1, 1, 0, 4, 2, 1, 0], [9, 1, 0, 4, -2, 1, 0], [1] * 7]}, "boxes: want finite .* row 1 is"),
+        ({"names": ["Truck"]}, "names: want one for each of the 3 boxes, got 1"),
+    ],
+)
+def test_a_mistake_in_a_format_names_the_frame(
+    mistake: dict[str, Any], message: str, config: Config, trained: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=f"^frame scan 1: {message}"):
+        Run(config, Data(Wrong(mistake), MyFrames([7])), tmp_path / "run")
+    with pytest.raises(InputError, match=f"^frame scan 1: {message}"):
+        score(load(trained / "checkpoint.pt", "cpu"), Wrong(mistake))
+    assert not (tmp_path / "run").exists()
+
+
+def test_two_frames_of_one_name(config: Config, trained: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^2 frames are named scan 0; rename all but one"):
+        Run(config, Data(MyFrames([0, 1, 0]), MyFrames([7])), tmp_path / "run")
+    with pytest.raises(InputError, match=r"^2 frames are named scan 5;"):
+        score(load(trained / "checkpoint.pt", "cpu"), MyFrames([5, 5]))
+
+
+def test_a_run_is_not_begun_over_another(config: Config, trained: Path) -> None:
+    before = contents(trained)
+    with pytest.raises(InputError, match="holds a run; resume it, or give another folder"):
+        Run(config, Data(MyFrames(range(4)), MyFrames(range(4, 6))), trained)
+    assert contents(trained) == before
+
+
+def test_a_stopped_run_goes_on_in_the_same_process(
+    config: Config, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a signal, and after a validation that was broken off: the record is that of a run in one go."""
+    run = Run(config, Data(MyFrames(range(4)), MyFrames(range(4, 6))), tmp_path / "run")
+    step, validate = Run.step, Run.validate
+    monkeypatch.setattr(Run, "step", lambda self, batch: (signal.raise_signal(signal.SIGTERM), step(self, batch))[1])
+    with pytest.raises(Stopped):
+        run.train()
+    monkeypatch.setattr(Run, "step", step)
+    monkeypatch.setattr(Run, "validate", lambda _: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run.train()
+    monkeypatch.setattr(Run, "validate", validate)
+    run.train()
+    assert (tmp_path / "run" / "metrics.jsonl").read_text() == (trained / "metrics.jsonl").read_text()
+
+
+def test_a_run_in_another_thread(config: Config, trained: Path, tmp_path: Path) -> None:
+    run = Run(config, Data(MyFrames(range(4)), MyFrames(range(4, 6))), tmp_path / "run")
+    thread = threading.Thread(target=run.train)
+    thread.start()
+    thread.join()
+    assert (tmp_path / "run" / "metrics.jsonl").read_text() == (trained / "metrics.jsonl").read_text()
 
 
 def test_a_run_leaves_torch_as_it_was(trained: Path, config: Config, tmp_path: Path) -> None:

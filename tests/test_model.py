@@ -15,7 +15,7 @@ from hvnet.network.model import Detections, HVNet
 from tests.models import CONFIGS, some_points
 
 
-def random_boxes(count: int, seed: int = 0) -> Tensor:
+def any_boxes(count: int, seed: int = 0) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     low = torch.tensor([0.0, -30.0, -2.0, 0.3, 0.3, 0.5, -math.pi])
     high = torch.tensor([64.0, 30.0, 1.0, 8.0, 3.0, 3.0, math.pi])

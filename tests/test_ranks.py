@@ -11,8 +11,8 @@ from torch import Tensor
 from hvnet import ranks
 from hvnet.config import Config, load_config
 from hvnet.network.model import HVNet
+from tests.helpers import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 NARROW = ["encoder.point_range=[0, -3.2, -3, 12.8, 3.2, 2]"]
 
 

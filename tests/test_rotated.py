@@ -13,22 +13,12 @@ import torch
 from torch import Tensor
 
 from hvnet.kernels import reference, rotated
+from tests.helpers import random_boxes
 
 DTYPES = (torch.float32, torch.float64)
 # float64: the reference itself rounds corners at 1e4 m to 2e-12 m. float32: sine, cosine and corners about the centre
 # carry a few 6e-8 of the box's length, times its outline over its area (up to 10 here)
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
-
-
-def random_boxes(count: int, seed: int, spread: float = 4.0, scale: float = 1.0, centre: float = 0.0) -> Tensor:
-    """Boxes (count, 7) float64 of 1 to 5 scales' length and width, within +-spread scales of the centre."""
-    generator = np.random.default_rng(seed)
-    boxes = np.empty((count, 7))
-    boxes[:, :3] = generator.uniform(-spread, spread, (count, 3)) * scale
-    boxes[:, :2] += centre
-    boxes[:, 3:6] = generator.uniform(1, 5, (count, 3)) * scale
-    boxes[:, 6] = generator.uniform(-math.pi, math.pi, count)
-    return torch.from_numpy(boxes)
 
 
 def polygons(boxes: Tensor) -> np.ndarray:

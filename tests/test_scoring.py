@@ -111,7 +111,9 @@ def test_labels_in_range(finder: Finder) -> None:
 def test_notes_are_printed_once(finder: Finder, capsys: pytest.CaptureFixture[str]) -> None:
     seen: set[str] = set()
     score(finder, Few(), seen=seen)
-    assert capsys.readouterr().out == "as ever\nof a\nof b\n"
+    assert capsys.readouterr().out == (
+        "as ever\nof a\nof b\nlabels of classes that the config does not have count as background: 2 cone\n"
+    )
     score(finder, Few(), seen=seen)
     assert capsys.readouterr().out == ""
     print_once(["", "of c", "of a", "of c"], seen)

@@ -24,7 +24,7 @@ from hvnet.network.checkpoint import load_checkpoint
 from hvnet.network.detector import Detector
 from hvnet.network.model import Detections, HVNet
 from hvnet.studies.catalogue import STUDIES, Row, Study
-from hvnet.studies.rows import Outcome, count_cars, score_in_range, with_budget
+from hvnet.studies.rows import Outcome, count_objects, score_in_range, with_budget
 from hvnet.studies.study import locked
 from hvnet.studies.tables import agreement, trained_table
 from hvnet.study import main
@@ -166,13 +166,15 @@ def test_score_counts_objects_in_range(scenes: Path, tmp_path: Path) -> None:
     assert figures == pytest.approx([100.0] * len(figures))
     worse = score_in_range(detector(2), frames)
     assert sum(table["bev"][2] or 0.0 for table in worse.values()) < 290
-    cars = count_cars(config, frames)
+    cars = count_objects(config, frames, "Car")
     assert 0 < cars < sum(list(frames.object_names(k) or ()).count("Car") for k in range(len(frames))) + 1
     for folder in ("velodyne", "label_2"):
         shutil.copytree(scenes / "training" / folder, tmp_path / "training" / folder)
     boxes = np.array([[x, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0] for x in (5.0, 10.0, 20.0)])
     write_labels(tmp_path / "training" / "label_2" / f"{frames.names[0]}.txt", boxes_to_labels(boxes, ["Car"] * 3))
-    assert count_cars(config, KittiFrames(tmp_path, frames.names[:1])) == 2  # no camera, one of three out of range
+    assert (
+        count_objects(config, KittiFrames(tmp_path, frames.names[:1]), "Car") == 2
+    )  # no camera, one of three out of range
 
 
 def test_every_seed_has_its_column() -> None:
@@ -231,7 +233,7 @@ def test_a_study_is_written_and_goes_on(
     assert re.search(r"\| every point \|.*\| 0\.0 \| 0\.0 \|.*\| 1\.00 \|", table)
     assert re.search(r"\| 8 points a voxel \|.*\d\* \|", table)  # is not fused
     assert re.search(r"All 2 seeds agree on the order of [01] of 1 pairs of rows", table)
-    assert re.search(r"Real: 2 frames, which hold \d+ moderate cars", table)
+    assert re.search(r"Real: 2 frames, which hold \d+ moderate objects of Car", table)
     with (tmp_path / "density.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [(row["row"], row["seed"], row["steps"]) for row in rows] == [

@@ -3,6 +3,7 @@
 Everything is in LiDAR axes: x forward, y left, z up, metres. `Camera` is all that knows of pixels.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -167,6 +168,10 @@ class Objects:
             raise ValueError(f"boxes: want shape (M, 7) with x, y, z, l, w, h, yaw, got {tuple(boxes.shape)}")
         if len(boxes) != len(self.names):
             raise ValueError(f"names: want one for each of the {len(boxes)} boxes, got {len(self.names)}")
+        wrong = ~boxes.isfinite().all(dim=1) | (boxes[:, 3:6] < 0).any(dim=1)
+        if wrong.any():
+            row = int(wrong.nonzero()[0])
+            raise ValueError(f"boxes: want finite numbers and sizes of 0 or more, row {row} is {boxes[row].tolist()}")
         object.__setattr__(self, "boxes", boxes)
         object.__setattr__(self, "names", tuple(str(name) for name in self.names))
 
@@ -220,5 +225,22 @@ def object_names(frames: Frames, k: int) -> Sequence[str] | None:
     own = getattr(frames, "object_names", None)
     if own is not None:
         return own(k)
-    objects = frames[k].objects
+    objects = frame_at(frames, k).objects
     return None if objects is None else objects.names
+
+
+def frame_at(frames: Frames, k: int) -> Frame:
+    """Frame k; what is wrong with its arrays raises InputError with its name."""
+    try:
+        return frames[k]
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"frame {frames.names[k]}: {error}") from error
+
+
+def check_names(frames: Frames) -> None:
+    """Raises InputError if two frames have one name: pictures and mistakes go by it."""
+    for name, count in Counter(frames.names).items():
+        if count > 1:
+            raise InputError(f"{count} frames are named {name}; rename all but one")

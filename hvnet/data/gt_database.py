@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from hvnet import ranks
 from hvnet.boxes import points_in_boxes
-from hvnet.data.frame import Frames
+from hvnet.data.frame import Frames, frame_at
 from hvnet.data.kitti import KittiFrames, boxes_to_labels
 from hvnet.data.labels import DONTCARE
 from hvnet.exceptions import InputError
@@ -100,7 +100,7 @@ def build_database(frames: Frames, wanted: Sequence[int] | None = None) -> Datab
             if not name.isdecimal() or int(name) >= 2**31:
                 raise InputError(f"frame '{name}': is no number below 2**31; the database keeps numbers")
             number = int(name)
-        frame = frames[k]
+        frame = frame_at(frames, k)
         if frame.objects is None:
             raise InputError(f"frame {name}: has no labels to cut objects out")
         boxes, every = frame.objects.boxes, frame.objects.labels

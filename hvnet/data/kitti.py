@@ -94,7 +94,10 @@ def read_frame(
     if labelled:
         rows = labels.select(labels.name != DONTCARE)
         boxes = torch.from_numpy(boxes_to_lidar(rows, camera)).float()
-        objects = Objects(boxes, rows.name.tolist(), labels)
+        try:
+            objects = Objects(boxes, rows.name.tolist(), labels)
+        except ValueError as error:
+            raise InputError(f"{folder / 'label_2' / frame_id}.txt: {error}") from error
     return Frame(frame_id, torch.from_numpy(points), objects, camera, notes)
 
 

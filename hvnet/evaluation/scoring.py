@@ -1,5 +1,6 @@
 """A detector on frames of any format: what it finds, and how good that is."""
 
+import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -9,7 +10,7 @@ from tqdm import tqdm
 
 from hvnet import ranks
 from hvnet.config import Config
-from hvnet.data.frame import Frame, Frames
+from hvnet.data.frame import Frame, Frames, check_names, frame_at
 from hvnet.data.kitti import centres_to_lidar, detections_to_labels, frame_labels
 from hvnet.data.labels import DONTCARE, Labels
 from hvnet.evaluation.precision import evaluate
@@ -33,7 +34,7 @@ def detect_frames(
     """Reads frames and detects in them; the notes on their files are printed, each once (those in `seen` not again)."""
     seen = set() if seen is None else seen
     for k in range(len(frames)) if wanted is None else wanted:
-        frame = frames[k]
+        frame = frame_at(frames, k)
         print_once(frame.notes, seen)
         found = detector(frame.points)
         names = found.names(detector.classes)
@@ -49,14 +50,17 @@ def score(
     visit: Callable[[Detected], None] | None = None,
     seen: set[str] | None = None,
     title: str = "scoring",
+    background: bool = True,
 ) -> dict[str, dict[str, Any]]:
     """Detects in labelled frames and scores the boxes as `evaluate` does, by the rules of the detector's config.
 
     in_range: labels whose centre is outside the detector's range do not count.
     visit: called for every frame of this rank, in their order.
+    background: say how many labels have a class that the detector does not know.
 
     Each rank takes its share of the frames; the scores are those of all.
     """
+    check_names(frames)
     share = range(ranks.rank(), len(frames), ranks.size())
     bar = tqdm(share, desc=title, unit="frame", leave=False, dynamic_ncols=True, disable=ranks.rank() > 0)
     pairs: list[tuple[Labels, Labels]] = []
@@ -68,6 +72,9 @@ def score(
     shares = ranks.all_gather(pairs)
     pairs = [shares[k % len(shares)][k // len(shares)] for k in range(len(frames))]  # in the order of the frames
     truths, found = [truth for truth, _ in pairs], [rows for _, rows in pairs]
+    if background and ranks.rank() == 0:
+        names = (str(name) for truth in truths for name in truth.name)
+        print_once([background_note(names, detector.classes)], set() if seen is None else seen)
     return evaluate(truths, found, classes=detector.classes, rules=rules or config_rules(detector.config))
 
 
@@ -81,13 +88,13 @@ def labels_in_range(frame: Frame, config: Config) -> Labels:
 
 
 def background_note(names: Iterable[str], classes: Iterable[str]) -> str:
-    """How many of the labels have a class that is not among these, for people; empty if all have."""
+    """How many of the labels have a class that is not among these, in lines of 100 characters; empty if none."""
     counts = Counter(names)
     others = {name: count for name, count in counts.most_common() if name not in set(classes) | {DONTCARE}}
     if not others:
         return ""
     listed = ", ".join(f"{count} {name}" for name, count in others.items())
-    return f"labels of classes that the config does not have count as background: {listed}"
+    return textwrap.fill(f"labels of classes that the config does not have count as background: {listed}", 100)
 
 
 def print_once(notes: Iterable[str], seen: set[str]) -> None:

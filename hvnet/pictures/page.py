@@ -27,7 +27,7 @@ from tqdm import tqdm
 from hvnet.data.frame import Frame, Frames
 from hvnet.evaluation.mistakes import MISS, Mistake, find_mistakes, worst
 from hvnet.evaluation.rules import Rule, config_rules
-from hvnet.evaluation.scoring import Detected, score
+from hvnet.evaluation.scoring import Detected, background_note, score
 from hvnet.evaluation.tables import format_table
 from hvnet.kernels.rotated import rotated_iou_bev
 from hvnet.network.detector import Detector
@@ -68,7 +68,8 @@ figcaption { margin-top: .3em }
 <body>
 <h1>What the detector gets wrong</h1>
 <p>{{ checkpoint }} in the {{ frames }} frames of the validation split of {{ root }}, at score {{ min_score }} or more:
-{{ misses_in_all }} misses and {{ false_positives_in_all }} false positives.</p>
+{{ misses_in_all }} misses and {{ false_positives_in_all }} false positives.
+{%- if background %} There are {{ background }}.{% endif %}</p>
 
 <h2>Evaluation</h2>
 <table>
@@ -256,8 +257,10 @@ def make_page(
     rules = rules or config_rules(detector.config)
     detections: dict[str, Detections] = {}
     mistakes: list[Mistake] = []
+    labelled: list[str] = []
 
     def visit(detected: Detected) -> None:
+        labelled.extend(detected.frame.objects.names if detected.frame.objects else ())
         detections[detected.frame.name] = detected.found
         mistakes.extend(find_mistakes(detected.frame, detected.found, rules, min_score))
 
@@ -277,6 +280,7 @@ def make_page(
             root=of,
             frames=len(frames),
             min_score=f"{min_score:g}",
+            background=background_note(labelled, detector.classes),
             misses_in_all=in_all,
             false_positives_in_all=len(mistakes) - in_all,
             measures=measures,

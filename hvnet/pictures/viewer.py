@@ -23,7 +23,7 @@ from torch import Tensor
 from hvnet.boxes import EDGES, box_corners
 from hvnet.data.frame import Frame, Frames, object_names
 from hvnet.evaluation.mistakes import MISS, Mistake, find_mistakes, worst
-from hvnet.evaluation.rules import config_rules
+from hvnet.evaluation.rules import Rule, config_rules
 from hvnet.exceptions import InputError
 from hvnet.kernels.voxel import Grid, voxel_index
 from hvnet.network.detector import Detector
@@ -131,10 +131,15 @@ class Viewer:
     Callbacks come from several threads. One at a time has the lock: a detector is not made for more.
     """
 
-    def __init__(self, server: "viser.ViserServer", detector: Detector, frames: Frames) -> None:
-        """Shows the first of the frames. Raises InputError if it cannot be read."""
+    def __init__(
+        self, server: "viser.ViserServer", detector: Detector, frames: Frames, rules: Mapping[str, Rule] | None = None
+    ) -> None:
+        """Shows the first of the frames. Raises InputError if it cannot be read.
+
+        rules: what a detection of a class has to reach; by default those of the detector's config.
+        """
         self.server, self.detector, self.frames = server, detector, frames
-        self.rules = config_rules(detector.config)
+        self.rules = rules or config_rules(detector.config)
         self.lock = threading.RLock()
         self.wanted = 0  # the frame that was asked for last
         self.frame, self.detections = Frame("", torch.zeros(0, 4)), NOTHING  # what is shown

@@ -70,11 +70,11 @@ def with_budget(config: Config, budget: str, frames: int) -> Config:
     return replace(config, train=replace(config.train, epochs=epochs))
 
 
-def count_cars(config: Config, frames: Frames) -> int:
-    """The moderate cars in range: one of them is so many times less than 100 points of recall."""
+def count_objects(config: Config, frames: Frames, name: str) -> int:
+    """The moderate objects of a class in range: one of them is so many times less than 100 points of recall."""
     labels = [labels_in_range(frames[k], config) for k in range(len(frames))]
     nothing = [no_results()] * len(labels)
-    return evaluate(labels, nothing, classes=["Car"])["Car"]["counts"]["ground_truths"][1]
+    return evaluate(labels, nothing, classes=[name])[name]["counts"]["ground_truths"][1]
 
 
 def dropped_share(config: Config, frames: Frames) -> float:

@@ -14,11 +14,12 @@ from torch import Tensor
 
 from hvnet.config import Config, SyntheticConfig, load_config
 from hvnet.data.kitti import KittiFrames, read_split_frames
+from hvnet.evaluation.rules import config_rules
 from hvnet.exceptions import InputError, Stopped
 from hvnet.network.detector import Detector, load
 from hvnet.network.model import HVNet
 from hvnet.studies.catalogue import STUDIES
-from hvnet.studies.rows import Outcome, count_cars, describe, read_result, row_folder, run_row, with_budget
+from hvnet.studies.rows import Outcome, count_objects, describe, read_result, row_folder, run_row, with_budget
 from hvnet.studies.tables import (
     UNFUSED,
     agreement_legend,
@@ -172,18 +173,20 @@ def train_rows(
     fused = {row for row, detector in detectors.items() if detector.is_fused(1)}
     steps = " or ".join(map(str, sorted({outcome.steps for outcome in outcomes})))
     trained_on = " and ".join(sorted({outcome.device for outcome in outcomes}))
+    overlaps = ", ".join(f"{rule.strict['bev']:g} ({name})" for name, rule in config_rules(first).items())
     lines = [
         *trained_table(STUDIES[name], outcomes, times, fused),
         "",
-        "mAP and the classes: exact AP in bird's eye view, moderate, in %, at an overlap of 0.7 (Car) and 0.5, of the "
+        f"mAP and the classes: exact AP in bird's eye view, moderate, in %, at an overlap of {overlaps}, of the "
         f"objects in range. {data.name}: {len(data.frames.train)} frames to train, {len(data.frames.val)} to validate; "
         f"{steps} steps of {first.train.batch_size} frames; trained on {trained_on}.",
         "",
         f"Time: of a cloud on {describe(options.device)}; the first row is 1." + UNFUSED * (fused < set(detectors)),
     ]
     if real:
-        cars = count_cars(first, real)
-        lines += ["", f"Real: {len(real)} frames, which hold {cars} moderate cars in range."]
+        name = first.head.classes[0].name
+        count = count_objects(first, real, name)
+        lines += ["", f"Real: {len(real)} frames, which hold {count} moderate objects of {name} in range."]
     if options.seeds > 1 and len(times) > 1:
         lines += ["", agreement_legend(outcomes, options.seeds)]
     return outcomes, times, lines

@@ -70,12 +70,14 @@ def trained_table(study: Study, outcomes: Sequence[Outcome], times: dict[str, Ti
     seeds = sorted({outcome.seed for outcome in outcomes})
     real = all(outcome.real is not None for outcome in outcomes)
     limited = any(outcome.dropped > 0 for outcome in outcomes)
-    measures = [(name, "bev") for name in outcomes[0].scores] + [("Car", "3d")]
-    measures += [("Car", "aos")] if any(row.name == "direction" for row in study.rows) else []
-    measures = [(name, measure) for name, measure in measures if name in outcomes[0].scores]
+    first_class = next(iter(outcomes[0].scores))
+    measures = [(name, "bev") for name in outcomes[0].scores] + [(first_class, "3d")]
+    measures += [(first_class, "aos")] if any(row.name == "direction" for row in study.rows) else []
     head = ["row", *["paper mAP"] * any(row.paper for row in study.rows), "mAP", *(f"seed {seed}" for seed in seeds)]
     head += [name if measure == "bev" else f"{name} {measure.upper()}" for name, measure in measures]
-    head += ["dropped %"] * limited + ["real: dropped %"] * (limited and real) + ["real: Car"] * real + ["time"]
+    head += (
+        ["dropped %"] * limited + ["real: dropped %"] * (limited and real) + [f"real: {first_class}"] * real + ["time"]
+    )
     lines = ["| " + " | ".join(head) + " |", "| --- |" + " ---: |" * (len(head) - 1)]
     first = None
     for row in study.rows:
@@ -91,8 +93,8 @@ def trained_table(study: Study, outcomes: Sequence[Outcome], times: dict[str, Ti
         cells += [shown(mean_of([each.scores[name][measure][1] for each in own])) for name, measure in measures]
         cells += [shown(100 * own[0].dropped)] * limited
         cells += [shown(100 * (own[0].real_dropped or 0.0))] * (limited and real)
-        cars = [each.real["Car"]["bev"][1] for each in own if each.real and "Car" in each.real]
-        cells += [shown(mean_of(cars))] * real
+        of_real = [each.real[first_class]["bev"][1] for each in own if each.real]
+        cells += [shown(mean_of(of_real))] * real
         lines.append("| " + " | ".join([*cells, f"{whole / first:.2f}" + "*" * (row.name not in fused)]) + " |")
     return lines
 
@@ -146,10 +148,10 @@ def draw_trained(path: Path, name: str, outcomes: Sequence[Outcome], times: dict
     axes = figure.add_subplot()
     if study.curves:
         for curve, colour, side in zip(study.curves, ("#1f77b4", "#d62728"), (-13, 6), strict=True):
-            shown = [row for row in rows if row.name in curve]
-            x = [sum(times[row.name]) for row in shown]
-            axes.plot(x, [means[row.name] for row in shown], "o-", color=colour)
-            for row, at in zip(shown, x, strict=True):
+            joined = [row for row in rows if row.name in curve]
+            x = [sum(times[row.name]) for row in joined]
+            axes.plot(x, [means[row.name] for row in joined], "o-", color=colour)
+            for row, at in zip(joined, x, strict=True):
                 seeds = [outcome.mean_ap() for outcome in outcomes if outcome.row.name == row.name]
                 axes.plot([at] * len(seeds), seeds, "_", color=colour, alpha=0.6)
                 axes.annotate(row.name, (at, means[row.name]), (5, side), textcoords="offset points", fontsize=8)
@@ -207,6 +209,7 @@ def write_csv(
 ) -> None:
     """Every row with every seed, or every row of the study of speed; `where` goes into every line."""
     lines: list[dict[str, object]] = []
+    classes = list(dict.fromkeys([*KITTI, *(name for outcome in outcomes for name in outcome.scores)]))
     for row in STUDIES[study].rows:
         if row.name not in times:
             continue
@@ -220,7 +223,7 @@ def write_csv(
             for level, title in enumerate(("easy", "moderate", "hard")):
                 line[f"mAP {title}"] = shown(outcome.mean_ap(level), 3)
             for prefix, scores in (("", outcome.scores), ("real ", outcome.real or {})):
-                for name, measure in itertools.product(KITTI, MEASURES):
+                for name, measure in itertools.product(classes, MEASURES):
                     value = scores[name][measure][1] if name in scores else None
                     line[f"{prefix}{name} {measure}"] = shown(value, 3)
             lines.append(common | line | stages | where | {"trained on": outcome.device})

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from hvnet import ranks
 from hvnet.config import Config
 from hvnet.data.augment import ObjectSampler, augment, mix_sectors
-from hvnet.data.frame import Frame, Frames, object_names
+from hvnet.data.frame import Frame, Frames, check_names, frame_at, object_names
 from hvnet.data.gt_database import Database, build_database, load_database
 from hvnet.data.kitti import read_split_frames
 from hvnet.data.scenes.files import generate
@@ -122,7 +122,7 @@ class TrainingFrames(Dataset[Sample | InputError]):
         notes: list[str] = []
         for at in [*range(k, len(self.frames)), *range(k)]:
             try:
-                frame = self.frames[at]
+                frame = frame_at(self.frames, at)
                 if frame.objects is None:
                     raise InputError(f"frame {frame.name}: has no labels")
                 break
@@ -189,6 +189,7 @@ def check_frames(frames: Frames, skip: bool, say: Callable[..., None]) -> tuple[
 
     The first mistake raises InputError or, with `skip`, is named and its frame left out.
     """
+    check_names(frames)
     good, names, last = [], Counter[str](), ""
     hidden = ranks.rank() > 0
     for k in tqdm(range(len(frames)), desc="checking", unit="frame", leave=False, dynamic_ncols=True, disable=hidden):

@@ -10,6 +10,7 @@ import json
 import math
 import os
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -71,8 +72,10 @@ class Run:
         self.board: SummaryWriter | None = None  # open in `train`
         self.signals: list[int] = []
         self.seen: set[str] = set()  # notes that were printed
+        if ranks.rank() == 0 and not resume and self.checkpoint.exists():
+            raise InputError(f"{out}: holds a run; resume it, or give another folder")
         with deterministic():
-            torch.manual_seed(config.train.seed)
+            torch.manual_seed(config.train.seed)  # torch's own generator: it goes into the checkpoints
             self.frames_id = hashlib.sha256(
                 json.dumps([list(data.train.names), list(data.val.names)]).encode()
             ).hexdigest()
@@ -222,8 +225,8 @@ class Run:
                     self.save()
                     saved = time.monotonic()
         self.save()
-        count = max(1.0, sums.pop("batches", 0.0))
-        return {name: total / count for name, total in sums.items()}
+        count = max(1.0, sums.get("batches", 0.0))
+        return {name: total / count for name, total in sums.items() if name != "batches"}
 
     def validate(self) -> dict[str, dict[str, Any]]:
         """Detects in the validation frames and scores the boxes as KITTI does; draws the first few."""
@@ -237,13 +240,14 @@ class Run:
                 draw_bev(self.out / "pictures" / f"{name}.png", subject, point_range, f"frame {name}")
 
         with deterministic():
-            return score(detector, self.data.val, visit=draw, seen=self.seen, title="validating")
+            return score(detector, self.data.val, visit=draw, seen=self.seen, title="validating", background=False)
 
     def train(self) -> None:
         """Runs the epochs that are left; writes checkpoint.pt, metrics.jsonl, tensorboard/ and pictures/.
 
         SIGTERM or SIGINT ends it after the step that is under way, saved, by raising Stopped.
         """
+        self.signals.clear()  # of an earlier call
         with caught_signals(self.signals), self.open_board():
             if not self.resumed:
                 self.save()  # a run that fails in its first epoch can go on
@@ -373,8 +377,12 @@ def deterministic() -> Iterator[None]:
 def caught_signals(signals: list[int]) -> Iterator[None]:
     """Inside, SIGTERM and SIGINT do not end the process: they are added to the list, and the loop looks there.
 
-    A second signal ends it at once: it raises Stopped wherever the program is.
+    A second signal ends it at once: it raises Stopped wherever the program is. Outside the main thread, where Python
+    allows no handlers, signals are left alone.
     """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
 
     def note(number: int, _: Any) -> None:
         if signals:
