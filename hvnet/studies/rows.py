@@ -94,7 +94,7 @@ def dropped_share(config: Config, frames: Frames) -> float:
 
 def score_in_range(detector: Detector, frames: Frames) -> Scores:
     """Exact BEV and 3D AP and AOS on labelled frames; objects outside of the detector's range do not count."""
-    result = score(detector, frames, in_range=True)
+    result = score(detector, frames, in_range=True, background=False)
     none: list[float | None] = [None] * 3  # of a measure that the labels do not allow
     return {name: {m: table["exact"].get(m, none) for m in MEASURES} for name, table in result.items()}
 

@@ -13,8 +13,10 @@ import torch
 from torch import Tensor
 
 from hvnet.config import Config, SyntheticConfig, load_config
+from hvnet.data.frame import object_names
 from hvnet.data.kitti import KittiFrames, read_split_frames
 from hvnet.evaluation.rules import config_rules
+from hvnet.evaluation.scoring import background_note
 from hvnet.exceptions import InputError, Stopped
 from hvnet.network.detector import Detector, load
 from hvnet.network.model import HVNet
@@ -164,6 +166,10 @@ def train_rows(
 ) -> tuple[list[Outcome], dict[str, Times], list[str]]:
     """Every other study: its rows, their times, and the text."""
     first = next(iter(configs.values()))
+    every = [data.frames.train, data.frames.val, *([real] if real else [])]
+    names = [each for frames in every for k in range(len(frames)) for each in object_names(frames, k) or ()]
+    if note := background_note(names, [entry.name for entry in first.head.classes]):
+        print(note)
     outcomes = run_rows(name, configs, data, real, options)
     detectors: dict[str, Detector] = {}
     for outcome in outcomes:  # of the first seed that there is
