@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hvnet.boxes import EDGES, box_corners
-from hvnet.data.frame import Frame, Frames, object_names
+from hvnet.data.frame import Frame, Frames, check_names, frame_at, object_names
 from hvnet.evaluation.mistakes import MISS, Mistake, find_mistakes, worst
 from hvnet.evaluation.rules import Rule, config_rules
 from hvnet.exceptions import InputError
@@ -32,7 +32,7 @@ from hvnet.network.model import Detections
 from hvnet.network.pillars import PillarEncoder
 from hvnet.pictures.clouds import CLASS_COLOURS, SHOWN_SCORE, TRUTH_COLOUR
 
-with contextlib.suppress(ImportError):  # the extra `view`; only the page wants it
+with contextlib.suppress(ImportError):  # the extra `view`; only the page needs it
     import rich
     import viser
 
@@ -42,11 +42,11 @@ LISTED = 8
 """Misses, and as many false positives, that the page lists."""
 CHOSEN_COLOUR = "#ffffff"
 REFLECTANCE = 0.6
-"""That has the brightest colour: little in KITTI's files is above it."""
+"""Reflectance shown in the brightest colour: little in KITTI's files is above it."""
 MAX_COUNTED = 100
-"""Points in a voxel that have the brightest colour."""
+"""Points in a voxel that is shown in the brightest colour."""
 START = (-6.0, 0.0, 7.0), (20.0, 0.0, -2.0)
-"""Where the camera stands and where it looks at first, LiDAR axes: from behind and above, over the sensor."""
+"""Where the camera starts and what it looks at, LiDAR axes: from behind and above, over the sensor."""
 NOTHING = Detections(torch.zeros(0, 7), torch.zeros(0), torch.zeros(0, dtype=torch.int64))
 
 
@@ -100,7 +100,7 @@ def ground_height(points: Tensor) -> float:
 
 
 def camera_for(box: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where a camera stands and looks at to show a box (7,): 10 m from it on the sensor's side, and 6 m above it."""
+    """Where a camera is placed and looks to show a box (7,): 10 m from it on the sensor's side, and 6 m above it."""
     centre = box[:3].double().numpy()
     distance = np.linalg.norm(centre[:2])
     away = centre[:2] / distance if distance > 0 else np.array([1.0, 0.0])
@@ -114,7 +114,7 @@ def mistake_line(mistake: Mistake) -> str:
 
 
 def paragraph(*lines: str) -> str:
-    """HTML of lines of text, as small as what stands beside the controls."""
+    """HTML of lines of text, as small as the labels of the controls."""
     text = "<br>".join(html.escape(line) for line in lines)
     return f'<div style="font-size: 0.8em; padding: 0.2em 1em">{text}</div>'
 
@@ -134,10 +134,11 @@ class Viewer:
     def __init__(
         self, server: "viser.ViserServer", detector: Detector, frames: Frames, rules: Mapping[str, Rule] | None = None
     ) -> None:
-        """Shows the first of the frames. Raises InputError if it cannot be read.
+        """Shows the first of the frames. Raises InputError if it cannot be read, or for a name used twice.
 
         rules: what a detection of a class has to reach; by default those of the detector's config.
         """
+        check_names(frames)
         self.server, self.detector, self.frames = server, detector, frames
         self.rules = rules or config_rules(detector.config)
         self.lock = threading.RLock()
@@ -194,7 +195,7 @@ class Viewer:
     def examine(self, index: int) -> tuple[Frame, Detections]:
         """A frame and what is detected in it, whose mistakes are noted. Raises InputError."""
         with self.lock:
-            frame = self.frames[index]
+            frame = frame_at(self.frames, index)
             if index not in self.found:
                 self.found[index] = self.detector(frame.points)
                 if frame.objects is not None:
@@ -204,6 +205,12 @@ class Viewer:
     def search(self) -> None:
         """Examines the frames with labels, one after the other, while the page is in use; lists the worst mistakes."""
         unread = unlabelled = 0
+
+        def notes(searched: int) -> list[str]:
+            lines = [f"{searched} of {len(self.frames)} frames searched at score {SHOWN_SCORE}"]
+            lines += [f"{unlabelled} have no labels"] * (unlabelled > 0)
+            return lines + [f"{unread} cannot be read"] * (unread > 0)
+
         for index in range(len(self.frames)):
             if index not in self.mistakes:
                 try:
@@ -214,8 +221,8 @@ class Viewer:
                 except (InputError, OSError):  # the page says what is wrong where the frame is chosen
                     unread += 1
                 time.sleep(0.01)  # lets a callback that waits have the lock
-            searched = f"{index + 1} of {len(self.frames)} frames searched at score {SHOWN_SCORE}"
-            self.list_mistakes(searched, *([f"{unread} cannot be read"] if unread else []))
+            self.list_mistakes(*notes(index + 1))
+        self.list_mistakes(*notes(len(self.frames)))
         if unlabelled == len(self.frames):
             self.progress.content = paragraph("no labels, so that no mistakes are known")
 
@@ -223,7 +230,7 @@ class Viewer:
         """Writes the worst of the mistakes known so far on the buttons, and some notes below."""
         with self.lock, self.server.atomic():
             for folder in self.folders:
-                folder.visible = True
+                folder.visible = bool(self.mistakes)
             self.listed = worst((mistake for part in self.mistakes.values() for mistake in part), LISTED)
             for column, mistakes in zip(self.buttons, self.listed, strict=True):
                 for button, mistake in zip(column, mistakes, strict=False):
@@ -237,11 +244,9 @@ class Viewer:
         with self.lock:
             if index == self.wanted:
                 try:
-                    frame, found = self.examine(index)
+                    self.show(*self.examine(index))
                 except (InputError, OSError) as error:
-                    frame = Frame(self.frames.names[index], torch.zeros(0, 4), notes=[str(error)])
-                    found = NOTHING
-                self.show(frame, found)
+                    self.show(Frame(self.frames.names[index], torch.zeros(0, 4), notes=[str(error)]), NOTHING)
 
     def choose(self, event: "viser.GuiEvent[viser.GuiDropdownHandle[str]]") -> None:
         """Shows the frame that a user chose; the chooser also follows frames that were reached in another way."""
@@ -264,9 +269,9 @@ class Viewer:
                     client.camera.position, client.camera.look_at = camera_for(mistake.box)
 
     def show(self, frame: Frame, found: Detections) -> None:
-        """Draws a frame."""
-        self.frame, self.detections = frame, found
+        """Draws a frame. Raises InputError if its image cannot be read."""
         image = frame.camera.read_image() if frame.camera is not None else None
+        self.frame, self.detections = frame, found
         truth, names = (NOTHING.boxes, ()) if frame.objects is None else (frame.objects.boxes, frame.objects.names)
         with self.server.atomic():
             self.chooser.value = frame.name  # type: ignore[misc]  # mypy misses viser's setter
