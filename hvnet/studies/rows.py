@@ -18,7 +18,7 @@ from hvnet.data.kitti import KittiFrames
 from hvnet.data.labels import no_results
 from hvnet.evaluation.precision import evaluate
 from hvnet.evaluation.scoring import labels_in_range, score
-from hvnet.exceptions import InputError
+from hvnet.exceptions import InputError, Stopped
 from hvnet.kernels.voxel import make_grid
 from hvnet.network.detector import Detector, load
 from hvnet.network.devices import device_name
@@ -109,7 +109,10 @@ def run_row(
         begin, resumed = time.monotonic(), checkpoint.is_file()
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / "log.txt").open("a", encoding="utf-8") as log, contextlib.redirect_stdout(log):
-            Run(config, data, folder, device, resume=resumed).train()
+            run = Run(config, data, folder, device, resume=resumed)
+            run.train()
+        if run.signals:  # came too late for the run to stop at, but there are further rows
+            raise Stopped("", run.signals[0])
         seconds = None if resumed else time.monotonic() - begin
         options = config.train
         known = {
