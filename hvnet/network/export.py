@@ -63,9 +63,15 @@ def image_names(config: Config) -> list[str]:
 
 
 def maps_of_class(config: Config, entry: ClassConfig) -> dict[str, str]:
-    """The fields of HeadMaps that a class has, and the names of their outputs."""
+    """The fields of HeadMaps that a class has, and the names of their outputs.
+
+    These begin with the class in lower case, or as it is written if only that tells it from another class.
+    """
     absent = {"direction": not config.head.direction, "iou": not config.head.iou}
-    return {field: f"{entry.name.lower()}_{field}" for field in HeadMaps._fields if not absent.get(field)}
+    lower = entry.name.lower()
+    alike = sum(other.name.lower() == lower for other in config.head.classes)
+    prefix = lower if alike == 1 else entry.name
+    return {field: f"{prefix}_{field}" for field in HeadMaps._fields if not absent.get(field)}
 
 
 def map_names(config: Config) -> list[str]:
