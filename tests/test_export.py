@@ -29,6 +29,7 @@ from tests.models import NARROW, lively, some_clouds
 
 DEMO = ROOT / "configs" / "demo.yaml"
 SMALL = [*NARROW, "head.score_threshold=0.02"]
+CLASSES = ("Car", "Pedestrian", "Cyclist")
 
 
 def scene(root: Path, count: int) -> tuple[Tensor, Tensor]:
@@ -135,6 +136,30 @@ def test_onnx_of_every_switch(changes: tuple[str, ...], tmp_path: Path) -> None:
     write_onnx(model, tmp_path / "part.onnx")
     with torch.no_grad():
         images = model.encoder(*some_clouds(2), 2)
+        want = by_name(model, model.maps_of(images))
+    assert_same_maps(maps_of_onnx(tmp_path / "part.onnx", images), want)
+
+
+@pytest.mark.parametrize(
+    ("names", "prefixes"),
+    [
+        (("Car", "Pedestrian", "Cyclist"), ["car", "pedestrian", "cyclist"]),
+        (("Car", "car", "Cyclist"), ["Car", "car", "cyclist"]),
+        (("Car", "car", "CAR"), ["Car", "car", "CAR"]),
+        (("Straßenbahn", "Élan", "image"), ["straßenbahn", "élan", "image"]),
+    ],
+)
+def test_no_two_outputs_have_one_name(names: tuple[str, ...], prefixes: list[str], tmp_path: Path) -> None:
+    """Classes that differ only in case as well."""
+    pytest.importorskip("onnx", reason="onnx is not installed: pip install '.[test]'")
+    changes = [f"head.classes.{old}.name={new}" for old, new in zip(CLASSES, names, strict=True)]
+    model = lively(load_config(DEMO, [*SMALL, "augment.objects={}", *changes[::-1]]))
+    outputs = map_names(model.config)
+    assert [name for name in outputs if name.endswith("_logits")] == [f"{prefix}_logits" for prefix in prefixes]
+    assert len(set(outputs)) == len(outputs) == len(names) * (len(outputs) // len(names))
+    write_onnx(model, tmp_path / "part.onnx")
+    with torch.no_grad():
+        images = model.encoder(*some_clouds(1), 1)
         want = by_name(model, model.maps_of(images))
     assert_same_maps(maps_of_onnx(tmp_path / "part.onnx", images), want)
 
