@@ -17,10 +17,10 @@ import yaml
 from hvnet.exceptions import InputError
 
 MAX_CELLS = 2**26
-"""Of the finest pseudo-image: 8192 x 8192, with 32 channels 8 GiB a sample."""
+"""Cells of the finest pseudo-image: 8192 x 8192; with 32 channels that is 8 GiB a sample."""
 MAX_CHANNELS = 4096
 MAX_LAYERS = 200
-"""Of a block; beyond these a config is taken for a mistake before it takes all memory."""
+"""Layers of a block. Larger configs are rejected as mistakes before they use up all memory."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class TrainConfig:
     decay_epochs: tuple[int, ...] = (40, 60)
     decay_ratio: float = 0.1
     cosine: bool = False  # after the warm-up half a cosine down to zero, instead of the steps at decay_epochs
-    repeat: int = 1  # times that an epoch goes through the frames, each time augmented anew
+    repeat: int = 1  # passes over the frames in an epoch, augmented differently each time
     gradient_clip: float = 10.0  # largest norm of the gradient
     validate_every: int = 10  # epochs; the last epoch is always validated
     pictures: int = 4  # validation frames drawn

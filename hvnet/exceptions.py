@@ -1,4 +1,4 @@
-"""What a caller may have to catch."""
+"""The exceptions that callers may have to catch."""
 
 
 class InputError(ValueError):

@@ -200,7 +200,7 @@ def nested_index(points: Tensor, sample: Tensor, grids: Sequence[Grid]) -> Neste
 
 @functools.cache
 def _nesting(grids: tuple[Grid, ...], device: torch.device) -> tuple[list[object], Tensor, int]:
-    """What the kernels want of grids that nest: the finest grid, then of every scale (S, 3) the bits of a Morton key to
+    """The kernels' inputs for grids that nest: the finest grid, then of every scale (S, 3) the bits of a Morton key to
     drop, N_L and N_W, and the bits of a key. Cached so that no frame triggers a
     host-to-device copy."""
     finest = min(grids, key=lambda grid: grid.cell)

@@ -60,5 +60,5 @@ def test_folders_to_begin_and_to_go_on(tmp_path: Path) -> None:
 def test_room(demo: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     check_room(tmp_path / "a" / "b", HVNet(demo))
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=10**6))
-    with pytest.raises(InputError, match=r"1 MB free, the run wants \d+ MB; free some, or give another --out"):
+    with pytest.raises(InputError, match=r"1 MB free, the run needs \d+ MB; free some, or give another --out"):
         check_room(tmp_path / "a" / "b", HVNet(demo))

@@ -2,75 +2,36 @@
 
 import base64
 import io
-import json
-import re
-import shutil
-import subprocess
-import sys
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 import torch
 from PIL import Image
 
-from hvnet.data.kitti import read_frame, read_split
+from hvnet.data.frame import Camera, Frame, Frames, Objects
+from hvnet.data.kitti import KittiFrames, read_frame, read_split, read_split_frames
 from hvnet.evaluation.mistakes import FALSE_POSITIVE, MISS, Mistake, find_mistakes, worst
 from hvnet.evaluation.rules import config_rules
-from hvnet.exceptions import InputError
-from hvnet.mistakes import main
 from hvnet.network.detector import load
-from hvnet.pictures.page import describe
-from tests.helpers import ROOT
+from hvnet.pictures.page import describe, make_page
+from hvnet.training.folder import find_run
+from tests.helpers import CAMERA
 from tests.models import TINY, save_untrained
-
-AVERAGES = {"R40": {"bev": [1.0, 2.0, 3.0], "3d": [0.0, 1.0, 2.0]}, "exact": {"bev": [1.0, 2.0, 3.0]}}
-METRICS = [
-    {"epoch": 1, "step": 2, "loss": 2.0, "classification": 1.5, "localization": 0.5},
-    {"epoch": 2, "step": 4, "loss": 1.0, "classification": 0.7, "localization": 0.3,
-     "validation": {"Car": AVERAGES, "Cyclist": {"R40": {"bev": [None] * 3}, "exact": {"bev": [None] * 3}}}},
-]  # fmt: skip
+from tests.pages import Page, write_run
 
 
 @pytest.fixture(scope="module")
 def run(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of an untrained detector in a folder whose name has to be escaped in HTML."""
-    out = tmp_path_factory.mktemp("runs") / "a <b> & c"
-    out.mkdir()
-    wide = ["encoder.point_range=[0, -12.8, -3, 25.6, 12.8, 2]", "head.score_threshold=0.0"]
-    save_untrained(out / "checkpoint.pt", [*TINY, *wide, "head.candidates=100", "head.detections=6"])
-    (out / "metrics.jsonl").write_text("".join(json.dumps(record) + "\n" for record in METRICS))
-    (out / "data.txt").write_text(f"{scenes}\n")
-    return out
+    """A run in a folder whose name has to be escaped in HTML."""
+    return write_run(tmp_path_factory.mktemp("runs") / "a <b> & c", scenes)
 
 
-class Page(HTMLParser):
-    """The tags of a page; every one that is opened is closed again, in order."""
-
-    VOID = ("meta", "img")
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.text = ""
-        self.feed(text)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-
-    def images(self, kind: str | None) -> list[dict[str, str | None]]:
-        return [attributes for tag, attributes in self.tags if tag == "img" and attributes.get("class") == kind]
+def page_of(run: Path, frames: Frames, count: int, min_score: float) -> str:
+    found = find_run(run)
+    detector = load(found.checkpoint, "cpu")
+    return make_page(
+        found.checkpoint, found.metrics, detector, frames, of=str(found.root), count=count, min_score=min_score
+    )
 
 
 def mistakes_of(run: Path, root: Path, min_score: float) -> list[Mistake]:
@@ -81,10 +42,8 @@ def mistakes_of(run: Path, root: Path, min_score: float) -> list[Mistake]:
 
 
 @pytest.mark.parametrize("count", [1, 7])
-def test_the_page_holds_a_crop_of_every_mistake(run: Path, scenes: Path, tmp_path: Path, count: int) -> None:
-    out = tmp_path / "new" / "page.html"
-    main([str(run), "--out", str(out), "--count", str(count), "--min-score", "0", "--device", "cpu"])
-    page = Page(out.read_text(encoding="utf-8"))
+def test_the_page_holds_a_crop_of_every_mistake(run: Path, scenes: Path, count: int) -> None:
+    page = Page(page_of(run, read_split_frames(scenes, "val"), count, 0.0))
     mistakes = mistakes_of(run, scenes, 0.0)
     kinds = [sum(each.kind == kind for each in mistakes) for kind in (MISS, FALSE_POSITIVE)]
     assert min(kinds) > 7
@@ -104,37 +63,58 @@ def test_the_page_holds_a_crop_of_every_mistake(run: Path, scenes: Path, tmp_pat
         assert name in page.text
 
 
-def test_a_page_of_pillars(pillars: Path, scenes: Path, tmp_path: Path) -> None:
+def test_a_page_of_pillars(pillars: Path, scenes: Path) -> None:
     """An untrained model finds nothing: all is missed."""
-    out = tmp_path / "page.html"
-    main([str(pillars), "--data", str(scenes), "--out", str(out), "--count", "2", "--device", "cpu"])
-    page = Page(out.read_text(encoding="utf-8"))
+    page = Page(page_of(pillars, read_split_frames(scenes, "val"), 2, 0.5))
     assert len(page.images("crop")) == 2
     assert "0 false positives" in page.text
 
 
-def test_any_class_has_mistakes(scenes: Path, tmp_path: Path) -> None:
-    """Vans, which KITTI does not score, at the overlap of the command or of the anchors' size."""
-    van = ["augment.objects={}", "head.classes.Cyclist.name=Van"]
-    few = ["head.score_threshold=0.0", "head.candidates=50", "head.detections=5"]
-    save_untrained(tmp_path / "model.pt", [*TINY, *few, *van])
-    given = [str(tmp_path / "model.pt"), "--data", str(scenes), "--min-score", "0", "--device", "cpu"]
-    main([*given, "--out", str(tmp_path / "page.html")])
-    page = Page((tmp_path / "page.html").read_text())
-    assert "Van detected" in page.text
-    assert "Cyclist BEV" not in page.text
-    assert re.search(r"labels of classes that the config does not have count as background: \d+ Cyclist\.", page.text)
-    assert "Van BEV0.5" in page.text  # as small as the anchors of Cyclist
-    main([*given, "--out", str(tmp_path / "other.html"), "--overlap", "Van=0.7"])
-    assert "Van BEV0.7" in Page((tmp_path / "other.html").read_text()).text
-    with pytest.raises(InputError, match=r"--overlap Cyclist=0\.7: no class Cyclist; there are Car, Pedestrian, Van"):
-        main([*given, "--out", str(tmp_path / "third.html"), "--overlap", "Cyclist=0.7"])
+class Own:
+    """A data format of a user: two frames, the first with a camera."""
+
+    names = ("first", "second")
+
+    def __len__(self) -> int:
+        return 2
+
+    def __getitem__(self, k: int) -> Frame:
+        cameras: tuple[Camera | None, ...] = (CAMERA, None)
+        objects = Objects(torch.tensor([[10.0, 0, -1, 4, 2, 1.5, 0]]), ["excavator"])
+        points = torch.rand(500, 4, generator=torch.Generator().manual_seed(k)) * 10
+        return Frame(self.names[k], points, objects, cameras[k])
 
 
-def test_nothing_comes_from_elsewhere(run: Path) -> None:
-    """The page is written to the run's folder, and all that it shows is inside."""
-    main([str(run), "--count", "1", "--device", "cpu"])
-    text = (run / "mistakes.html").read_text(encoding="utf-8")
+def test_frames_of_another_format(tmp_path: Path) -> None:
+    """Of a class that KITTI does not know; with a camera the crop is in the image as well."""
+    own = ["augment.objects={}", "head.classes.Cyclist.name=excavator"]
+    few = ["head.score_threshold=0.0", "head.candidates=50", "head.detections=1"]
+    save_untrained(tmp_path / "model.pt", [*TINY, *few, *own])
+    page = Page(page_of(tmp_path / "model.pt", Own(), 2, 1.0))
+    assert "2 misses and 0 false positives" in page.text
+    assert "excavator BEV0.5" in page.text
+    assert {name for name in Own.names if f"excavator, frame {name}" in page.text} == set(Own.names)
+    widths = []
+    for crop in page.images("crop"):
+        picture = base64.b64decode((crop["src"] or "").removeprefix("data:image/png;base64,"), validate=True)
+        with Image.open(io.BytesIO(picture)) as image:
+            widths.append(image.width)
+    assert sorted(widths) == [336, 912]  # 2.8 and 7.6 inches
+
+
+def test_a_real_frame(run: Path, kitti_root: Path) -> None:
+    """With its image: crops of the labelled objects that an untrained detector misses."""
+    name = sorted((kitti_root / "training" / "image_2").iterdir())[0].stem
+    page = Page(page_of(run, KittiFrames(kitti_root, [name]), 3, 1.0))
+    frame = read_frame(kitti_root, name)
+    known = len(frame.boxes_of(["Car", "Pedestrian", "Cyclist"]))
+    assert f"{known} misses and 0 false positives" in page.text
+    assert len(page.images("crop")) == min(known, 3)
+
+
+def test_nothing_comes_from_elsewhere(run: Path, scenes: Path) -> None:
+    """All that the page shows is inside."""
+    text = page_of(run, read_split_frames(scenes, "val"), 1, 0.5)
     page = Page(text)
     assert {tag for tag, _ in page.tags} & {"script", "link", "iframe", "object"} == set()
     assert "http" not in text
@@ -147,15 +127,12 @@ def test_nothing_comes_from_elsewhere(run: Path) -> None:
     assert b"<svg" in svg
 
 
-def test_a_checkpoint_alone(run: Path, scenes: Path, tmp_path: Path) -> None:
-    """Without metrics there are no curves; where nothing is wrong there is no crop."""
-    checkpoint = tmp_path / "model.pt"
-    checkpoint.write_bytes((run / "checkpoint.pt").read_bytes())
-    out = tmp_path / "page.html"
-    main([str(checkpoint), "--data", str(scenes), "--out", str(out), "--min-score", "1", "--count", "1"])
-    page = Page(out.read_text(encoding="utf-8"))
+def test_without_metrics_and_mistakes(run: Path, scenes: Path, tmp_path: Path) -> None:
+    """There are no curves; where nothing is wrong there is no crop."""
+    (tmp_path / "model.pt").write_bytes((run / "checkpoint.pt").read_bytes())
+    page = Page(page_of(tmp_path / "model.pt", read_split_frames(scenes, "val"), 1, 1.0))
     assert page.images(None) == []
-    assert "No metrics.jsonl" in page.text
+    assert "metrics.jsonl" in page.text
     assert "None." in page.text  # no false positive has a score of 1
 
 
@@ -172,53 +149,3 @@ def test_descriptions() -> None:
         "score 0.25, 20.6 m away, 7 points in the box, outside the detector's range, best overlap with a label 0.50"
     )
     assert describe(wrong._replace(overlap=0.0), point_range).endswith("no label of its class there")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["missing"], "missing: no such run"),
-        (["{empty}"], "holds no checkpoint.pt"),
-        (["{checkpoint}"], "does not name the data that it was trained on; give a KITTI root with --data"),
-        (["{run}", "--data", "{empty}"], "val.txt: no such file"),
-        (["{run}", "--out", "{empty}"], "is a folder; --out names the page"),
-        (["{binary}"], "data.txt: is no text that names a KITTI root"),
-        (["{shallow}", "--data", "{empty}"], "metrics.jsonl:1: no record of hvnet.train; remove the line"),
-        (["{run}", "--out", "{run}/checkpoint.pt/x.html"], "checkpoint.pt: no folder; --out names the page"),
-        (["{broken}", "--data", "{empty}"], "metrics.jsonl:2: no record of hvnet.train; remove the line"),
-    ],
-)
-def test_mistakes_of_the_user(run: Path, tmp_path: Path, arguments: list[str], message: str) -> None:
-    for name in ("empty", "broken", "alone"):
-        (tmp_path / name).mkdir()
-    for name in ("broken", "alone"):
-        (tmp_path / name / "checkpoint.pt").write_bytes((run / "checkpoint.pt").read_bytes())
-    for name, data in (("binary", b"\xff\xfe"), ("shallow", None)):
-        (tmp_path / name).mkdir()
-        shutil.copy(run / "checkpoint.pt", tmp_path / name)
-        if data:
-            (tmp_path / name / "data.txt").write_bytes(data)
-    (tmp_path / "shallow" / "metrics.jsonl").write_text('{"epoch": 1, "validation": {"Car": {}}}\n')
-    (tmp_path / "broken" / "metrics.jsonl").write_text(json.dumps(METRICS[0]) + '\n{"epo')
-    places = {"run": run, "checkpoint": tmp_path / "alone" / "checkpoint.pt"}
-    places |= {name: tmp_path / name for name in ("empty", "broken", "binary", "shallow")}
-    with pytest.raises(InputError, match=re.escape(message)):
-        main([each.format(**places) for each in [*arguments, "--device", "cpu"]])
-
-
-@pytest.mark.parametrize(
-    "option", [["--count", "0"], ["--count", "a"], ["--min-score", "x"], ["--min-score", "2"], ["--min-score", "nan"]]
-)
-def test_options_that_mean_nothing(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as raised:
-        main(["missing", *option])
-    assert raised.value.code == 2
-    assert f"argument {option[0]}: " in capsys.readouterr().err.splitlines()[-1]
-
-
-def test_a_mistake_is_one_line() -> None:
-    command = [sys.executable, "-m", "hvnet.mistakes", "missing"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith("error: missing: no such run; give ")
-    assert done.stderr.count("\n") == 1

@@ -53,7 +53,7 @@ def augment(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Augments one frame: points (N, 4), boxes (M, 7) and labels (M,), which number the boxes' classes in `classes`.
 
-    The points may lie on a GPU; boxes and labels stay on the host, where what is drawn depends on them.
+    The points may be on a GPU; boxes and labels stay on the host, because the random choices depend on them.
 
     Objects are inserted first, as in SECOND, which the paper follows, though it names the global changes first: objects
     keep the pose in which the scanner saw them, which is in the camera's view only before the frame is turned.
@@ -196,8 +196,8 @@ def _insert(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Inserts rows of the database, in this order, into a frame.
 
-    An object that collides in bird's eye view with a box of the frame or with one inserted before is given up, not
-    redrawn. Points of the frame inside an inserted box give way to the object's own.
+    An object that collides in bird's eye view with a box of the frame or with one inserted before is skipped, not
+    replaced. Points of the frame inside an inserted box give way to the object's own.
     """
     drawn_boxes = torch.from_numpy(objects.database.box[drawn])
     collides = boxes_collide(drawn_boxes, torch.cat((boxes, drawn_boxes))).numpy()

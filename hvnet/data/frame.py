@@ -1,4 +1,4 @@
-"""One frame of any sensor: its points, what is labelled in it, and the camera beside the LiDAR, if there is one.
+"""One frame of any sensor: its points, what is labelled in it, and the camera next to the LiDAR, if there is one.
 
 Everything is in LiDAR axes: x forward, y left, z up, metres. `Camera` is all that knows of pixels.
 """

@@ -23,14 +23,14 @@ from hvnet.exceptions import InputError
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
 """The classes of KITTI's label files."""
 
-# camera axes that are in the LiDAR and look along its x: those of the labels where there is no camera
+# camera axes at the LiDAR, looking along its x: those of the labels if there is no camera
 AT_LIDAR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
 
 class KittiFrames:
     """Frames of a KITTI root, training/ or testing/: a `Frames`.
 
-    labelled: True reads the labels and wants them, False does not, None reads those that there are.
+    labelled: True requires and reads the labels, False does not read them, None reads those that exist.
     crop: keep only the points in the camera's view, where objects are labelled.
     """
 

@@ -314,7 +314,7 @@ def _changes(
     truth_alpha: Floats,
     detection_alpha: Floats,
 ) -> Floats:
-    """What changes where a threshold passes a score of a frame: (E, 5) float64.
+    """The changes in the counts as the threshold passes each score of a frame: (E, 5) float64.
 
     The score, and the differences in true positives, in ground truths matched with an ignored detection, in countable
     detections that are taken, and in similarity.

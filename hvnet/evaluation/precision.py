@@ -94,7 +94,7 @@ def evaluate(
 
 
 def _median_length(candidates: Candidates, name: str) -> float:
-    """Of the labelled objects of a class, of the detections where there are none; metres."""
+    """Median length in metres of the labelled objects of a class, or of its detections if none is labelled."""
     for rows in (candidates.truths, candidates.detections):
         lengths = rows.dimensions[rows.name == name, 2]
         if (lengths > 0).any():
@@ -225,7 +225,7 @@ def _best_score(curves: Sequence[Counts]) -> float:
 def _report(
     candidates: Candidates, matchings: Sequence[Matching], threshold: float, points: Integers | None
 ) -> dict[str, Any]:
-    """What is missed and what is found wrongly when the detections below a score are dropped."""
+    """Misses and false positives when the detections below a score are dropped."""
     counts: dict[str, list[int]] = {"ground_truths": [], "misses": [], "false_positives": []}
     distance = candidates.truths.ground_distance()
     groups = {"recall_by_distance": {band: _between(distance, limits) for band, limits in DISTANCES.items()}}
@@ -255,7 +255,7 @@ def _between(values: NDArray, limits: tuple[float, float]) -> Mask:
 
 
 def _warnings(truths: Labels, detections: Labels, levels: Sequence[Level], counts: Sequence[int]) -> list[str]:
-    """What a reader of the figures has to know; truths and detections are those of the class."""
+    """Caveats for the reader of the figures; truths and detections are those of the class."""
     warnings = []
     if any(level.min_height > 0 for level in levels):
         for objects, kind in ((truths, "label"), (detections, "detection")):

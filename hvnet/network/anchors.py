@@ -15,10 +15,10 @@ ORIENTATIONS = (0.0, math.pi / 4, math.pi / 2, 3 * math.pi / 4)
 
 
 class Targets(NamedTuple):
-    """What the loss wants of the anchors of one class, over a batch: P are positive, in the order of nonzero()."""
+    """Targets of the anchors of one class over a batch; P of them are positive, in the order of nonzero()."""
 
     positive: Tensor  # (B, A) bool
-    negative: Tensor  # (B, A) bool; anchors that are neither count for nothing
+    negative: Tensor  # (B, A) bool; anchors that are neither are ignored
     location: Tensor  # (P, 8) metres, or (P, 5)
     vertical: Tensor  # (P, 2)
     direction: Tensor  # (P,) int64

@@ -67,7 +67,7 @@ class Detector:
     def __call__(self, points: Tensor | NDArray) -> Detections:
         """Points (N, 4), x, y, z in metres and reflectance in [0, 1], to boxes (M, 7), scores (M,), labels (M,).
 
-        Points outside the range and points that are not finite are ignored. The results lie on the host.
+        Points outside the range and points that are not finite are ignored. The results are on the host.
         """
         return self.batch([points])[0]
 
@@ -230,7 +230,7 @@ def regression_weight(head: Head) -> Tensor:
 
 
 def regress(level: Tensor, at: Tensor, weight: Tensor, anchors: int) -> Tensor:
-    """What a head's 3 x 3 convolutions say of the anchors at (K,) of a level (C, N_L, N_W): (K, values) float32."""
+    """The outputs of a head's 3 x 3 convolutions for the anchors at (K,) of a level (C, N_L, N_W): (K, values)."""
     channels, n_l, n_w = level.shape
     rows = level.permute(1, 2, 0).reshape(-1, channels)
     cell = at // anchors

@@ -1,6 +1,6 @@
 """A trained model for other programs.
 
-backbone_heads.onnx holds what lies between the pseudo-images and the maps of the heads, in standard operators.
+backbone_heads.onnx holds the part between the pseudo-images and the maps of the heads, in standard operators.
 detector.pt2 holds encoder, backbone and heads as one program of torch.export, with the kernels as custom ops: it takes
 points. Both end at the maps, whose size is fixed; meta.json says what decoding them and NMS need. docs/deploy.md has
 worked examples.
@@ -22,7 +22,7 @@ from hvnet.network.head import HeadMaps
 from hvnet.network.model import HVNet
 
 OPSET = 17
-"""Of ONNX: all operators here are older, and so are the programs that read them."""
+"""ONNX opset. All operators used here are older, so that older runtimes read them too."""
 
 
 class BackboneHeads(nn.Module):
@@ -117,7 +117,7 @@ def write_program(model: HVNet, path: Path, batch_size: int) -> None:
     points, sample = torch.zeros(8, 4), torch.zeros(8, dtype=torch.int64)
     count = torch.export.Dim("points")
     module = PointsToMaps(copy.deepcopy(model), batch_size).eval().requires_grad_(False)
-    # torch.export.save wants weights in the order in which they lie in memory
+    # torch.export.save needs weights that are contiguous in memory
     module.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
     program = torch.export.export(module, (points, sample), dynamic_shapes=({0: count}, {0: count}))
     for node in program.graph.nodes:
@@ -126,7 +126,7 @@ def write_program(model: HVNet, path: Path, batch_size: int) -> None:
 
 
 def describe(config: Config, batch_size: int) -> dict[str, Any]:
-    """What meta.json holds: inputs, outputs, the layout of the anchors, thresholds. Metres and radians."""
+    """The content of meta.json: inputs, outputs, the layout of the anchors, thresholds. Metres and radians."""
     encoder, head = config.encoder, config.head
     grids = projection_grids(encoder)
     finest = grids[0]

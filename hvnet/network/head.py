@@ -13,7 +13,7 @@ PRIOR = 0.01  # probability of an object that an untrained head gives (RetinaNet
 
 
 class HeadMaps(NamedTuple):
-    """What a head says of the A anchors of its class, for every sample."""
+    """The outputs of a head for the A anchors of its class, for every sample."""
 
     logits: Tensor  # (B, A)
     location: Tensor  # (B, A, 8) offsets of the corners in metres, or (B, A, 5), see `anchors.encode`
@@ -47,7 +47,7 @@ class Head(nn.Module):
         nn.init.constant_(self.score.bias, -math.log((1 - PRIOR) / PRIOR))  # type: ignore[arg-type]
 
     def forward(self, level: Tensor) -> HeadMaps:
-        """The class's pyramid level (B, C, N_L, N_W) to what is said of its N_L * N_W * N_anc anchors."""
+        """The class's pyramid level (B, C, N_L, N_W) to the outputs for its N_L * N_W * N_anc anchors."""
         return HeadMaps(
             anchor_rows(self.score(level), 1).squeeze(-1),
             anchor_rows(self.location(level), self.location.out_channels // self.score.out_channels),

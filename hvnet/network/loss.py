@@ -80,7 +80,7 @@ def _edge_areas(x0: Tensor, y0: Tensor, x1: Tensor, y1: Tensor, l: Tensor, w: Te
     long = span.abs() > 1e-6
 
     def integral(x: Tensor) -> Tensor:
-        """Of clamp(t, -l, l) from 0 to x."""
+        """The integral of clamp(t, -l, l) from 0 to x."""
         return torch.where(x.abs() <= l, x.square() / 2, l * x.abs() - l.square() / 2)
 
     mean = torch.where(long, (integral(end) - integral(start)) / span.where(long, 1.0), torch.clamp(start, -l, l))

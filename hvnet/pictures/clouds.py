@@ -27,12 +27,12 @@ from hvnet.network.model import Detections
 FORMATS = ("png", "svg", "pdf")
 TRUTH_COLOUR = "#1a9850"
 SHOWN_SCORE = 0.5
-"""Detections below are left out of pictures, which they would only fill."""
+"""Detections below this score are not drawn: they would clutter the picture."""
 CLASS_COLOURS = ("#d62728", "#1f77b4", "#ff7f0e", "#9467bd")
 FRONT = [0, 1, 5, 4]
 """A box's face in front, in the order of box_corners."""
 WIDTH = 8.0
-"""Of a picture, in inches."""
+"""Width of a picture in inches."""
 
 Colour = Literal["height", "reflectance"]
 

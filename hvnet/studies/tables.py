@@ -25,7 +25,7 @@ PAPER_STAGES = (12.0, 11.0, 9.0)
 
 
 def short_table(study: Study, outcomes: Sequence[Outcome], times: dict[str, Times]) -> list[str]:
-    """What of a study fits a terminal: mAP, or the stages where nothing is trained, and the time."""
+    """A study's table for the terminal: mAP, or the stages if nothing is trained, and the time."""
     paper = any(row.paper is not None for row in study.rows)
     stages = [stage.replace(" and", ",") for stage in STAGES]
     what = ["mAP, mean", *["paper's"] * paper, "ms a cloud"] if outcomes else [*stages, "ms a cloud", "2080 Ti, ms"]
@@ -42,8 +42,7 @@ def short_table(study: Study, outcomes: Sequence[Outcome], times: dict[str, Time
 
 
 def agreement(outcomes: Sequence[Outcome]) -> tuple[int, int, float]:
-    """Of how many pairs of rows all seeds agree which is better, of how many pairs, and how far the seeds of a row are
-    apart in the median, in points of mAP."""
+    """The pairs of rows whose order all seeds agree on, all pairs, and the median spread of a row's seeds in mAP."""
     of_row: dict[str, dict[int, float]] = {}
     seen: set[Path] = set()
     for outcome in outcomes:
@@ -100,7 +99,7 @@ def trained_table(study: Study, outcomes: Sequence[Outcome], times: dict[str, Ti
 
 
 def speed_table(study: Study, times: dict[str, Times], device: str) -> list[str]:
-    """The Markdown table of the study of speed: this device beside the paper's."""
+    """The Markdown table of the study of speed: this device next to the paper's."""
     lines = [
         f"| row | RTX 2080 Ti (the paper's), ms | {device}, ms | " + " | ".join(STAGES) + " |",
         "| --- |" + " ---: |" * (2 + len(STAGES)),

@@ -10,11 +10,11 @@ from hvnet.folders import check_empty
 from hvnet.network.model import HVNet
 
 ROOM = 100 * 2**20
-"""Bytes beside the checkpoints that a run may need on the disk."""
+"""Bytes that a run may need on the disk in addition to its checkpoints."""
 
 
 class RunFolder(NamedTuple):
-    """What there is of a training run."""
+    """The files of a training run."""
 
     checkpoint: Path
     metrics: list[dict[str, Any]]  # a record an epoch, none where there is no metrics.jsonl
@@ -67,5 +67,5 @@ def check_room(out: Path, model: HVNet) -> None:
     wanted = 2 * 3 * sum(weight.numel() * weight.element_size() for weight in model.parameters()) + ROOM
     if free < wanted:
         raise InputError(
-            f"{folder}: {free / 1e6:.0f} MB free, the run wants {wanted / 1e6:.0f} MB; free some, or give another --out"
+            f"{folder}: {free / 1e6:.0f} MB free, the run needs {wanted / 1e6:.0f} MB; free some, or give another --out"
         )

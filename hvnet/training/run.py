@@ -41,11 +41,11 @@ CHANGEABLE = [
     f"train.{key}"
     for key in ("epochs", "learning_rate", "validate_every", "pictures", "workers", "skip_corrupt", "skip_non_finite")
 ]
-"""What may differ from the run that is resumed; the epochs only if the learning rate does not depend on them."""
+"""Keys that may differ from the run being resumed; epochs only if the learning rate does not depend on them."""
 
 
 class Progress(NamedTuple):
-    """How far a run has come, and the sums of its losses in the epoch that is under way."""
+    """How far a run has got, and the sums of the losses in its current epoch."""
 
     epoch: int = 0  # epochs done, with their validation
     batch: int = 0  # batches done of the next one
@@ -64,7 +64,7 @@ class Run:
         Raises InputError for a mistake in the data or the checkpoint.
         """
         device = torch.device(device)
-        if device.type == "cuda":  # the frames lie on the device, and worker processes have none
+        if device.type == "cuda":  # frames are kept on the device, and worker processes have none
             config = replace(config, train=replace(config.train, workers=0))
         self.config, self.data, self.out, self.device = config, data, Path(out), device
         self.checkpoint = self.out / "checkpoint.pt"
@@ -118,7 +118,7 @@ class Run:
         names += check_frames(data.val, False, self.say)[1]
         classes = [entry.name for entry in config.head.classes]
         self.background = background_note(names, classes)
-        # worker processes know no GPU; without them the frames lie on it
+        # worker processes do not use the GPU; without them the frames are kept on it
         place = self.device if config.train.workers == 0 else torch.device("cpu")
         objects = None
         if config.augment.objects or config.augment.whole_frames:

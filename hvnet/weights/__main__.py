@@ -33,7 +33,7 @@ RECIPE = (
     "augment.mix=0.5",
     "augment.whole_frames=0.2",
 )
-"""What differs from the config; docs/training.md says why."""
+"""Changes to the config; docs/training.md gives the reasons."""
 
 
 def halve(checkpoint: Path, out: Path) -> None:

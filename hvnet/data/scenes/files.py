@@ -19,10 +19,10 @@ from hvnet.data.scenes.street import Floats, Options, Scene, build_scene
 from hvnet.exceptions import InputError
 
 VERSION = 1
-"""Raise it when the same seed gives other scenes: older folders are then refused instead of reused."""
+"""Increase this when a seed gives other scenes than before, so that older folders are rejected, not reused."""
 
 MIN_POINTS = 5
-"""An object with fewer points is a DontCare region: KITTI's annotators had nothing to fit a box to, either."""
+"""An object with fewer points is a DontCare region: KITTI's annotators could not fit a box to so few either."""
 
 OCCLUSION = (0.15, 0.5, 0.85)
 """Shares of an object that is hidden from which on it has occlusion 1, 2 and 3."""

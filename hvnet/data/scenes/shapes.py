@@ -1,4 +1,4 @@
-"""Triangle meshes of what stands in a street: cars, vans, people, bicycles, trees, buildings and clutter.
+"""Triangle meshes of the things in a street: cars, vans, people, bicycles, trees, buildings and clutter.
 
 Metres; x forward, y left, z up. Unless said otherwise a thing faces +x and stands on z = 0, its middle over the origin.
 Nearly everything is a loft: rings of points joined to a skin.
@@ -18,7 +18,7 @@ Point = tuple[float, float, float]
 
 
 class Material(IntEnum):
-    """What a face is made of; `synthetic.SURFACE` says how each reflects."""
+    """What a face is made of; `scanner.SURFACE` says how each reflects."""
 
     ASPHALT = 0
     PAVING = auto()

@@ -169,7 +169,7 @@ def _ground(rng: np.random.Generator, road: Road) -> tuple[Ground, Mesh]:
 
 @dataclass(frozen=True)
 class Thing:
-    """Something that stands in the scene without a label, still in the road's axes."""
+    """An unlabelled thing in the scene, still in the road's axes."""
 
     mesh: Mesh
     pose: tuple[float, float, float]  # u, v, yaw
@@ -177,7 +177,7 @@ class Thing:
 
 
 def _plots(rng: np.random.Generator, road: Road) -> tuple[list[Thing], Floats]:
-    """What stands beyond the sidewalks, and the poses (P, 3) in the road's axes of cars on parking lots."""
+    """The things beyond the sidewalks, and the poses (P, 3) in the road's axes of cars on parking lots."""
     near, far = road.reach
     low, high = road.crossing - road.crossing_width / 2 - 2, road.crossing + road.crossing_width / 2 + 2
     stretches = [(near, far)] if math.isinf(road.crossing) else [(near, low), (high, far)]
@@ -200,7 +200,7 @@ def _plots(rng: np.random.Generator, road: Road) -> tuple[list[Thing], Floats]:
 
 
 def _plot(rng: np.random.Generator, length: float) -> tuple[list[Thing], list[tuple[float, float]]]:
-    """What stands on one plot, and the x and yaw of the cars if it is a parking lot; y = 0 is the sidewalk's edge."""
+    """The things on one plot, and the x and yaw of the cars if it is a parking lot; y = 0 is the sidewalk's edge."""
     kind = rng.choice(["house", "garden", "open", "lot"], p=[0.29, 0.33, 0.27, 0.11])
     things = []
     if kind != "open":
