@@ -1,5 +1,5 @@
 """The configuration: a tree of frozen dataclasses, read from YAML. Unknown keys, wrong types and impossible values
-are refused with the dotted key. Defaults are the paper's (Sec. 4.1), see configs/hvnet.yaml."""
+are rejected with the dotted key. Defaults are the paper's (Sec. 4.1), see configs/hvnet.yaml."""
 
 import dataclasses
 import itertools
@@ -17,10 +17,10 @@ import yaml
 from hvnet.exceptions import InputError
 
 MAX_CELLS = 2**26
-"""Of the finest pseudo-image: 8192 x 8192, with 32 channels 8 GiB a sample."""
+"""Limit for the finest pseudo-image: 8192 x 8192, which is 8 GiB a sample with 32 channels."""
 MAX_CHANNELS = 4096
 MAX_LAYERS = 200
-"""Of a block; beyond these a config is taken for a mistake before it takes all memory."""
+"""Limit for one block. A config beyond these limits is rejected as a mistake before it fills the memory."""
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,13 @@ class EncoderConfig:
     # AVFE and AVFEO; VoxelNet's VFE layers in their place; or one layer of PointPillars' features
     vfe: Literal["attentive", "plain", "pillar"] = "attentive"
     attention_relu: bool = False  # a ReLU before the product of the AVFE layers
-    point_limit: int = 0  # hard voxels: most points of a voxel of voxel_size, the others are dropped; 0 is no limit
-    voxel_limit: int = 0  # most such voxels of a sample
+    point_limit: int = 0  # hard voxels: maximum points per voxel of voxel_size, the others are dropped; 0: no limit
+    voxel_limit: int = 0  # maximum number of such voxels per sample
 
 
 @dataclass(frozen=True)
 class BackboneConfig:
-    """Main stream and pyramid: one width and one number of layers a block; further blocks are like the last named."""
+    """Main stream and pyramid: one width and one number of layers per block; further blocks repeat the last entry."""
 
     widths: tuple[int, ...] = (64, 128, 256)
     layers: tuple[int, ...] = (3, 5, 5)
@@ -64,7 +64,7 @@ class ClassConfig:
     focal_alpha: float
     focal_gamma: float
     nms_iou: float
-    overlap: float | None = None  # with a label that a detection has to reach in the evaluation; default: by size
+    overlap: float | None = None  # IoU with a label that a detection needs in the evaluation; default: by size
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,8 @@ class HeadConfig:
     direction: bool = False  # the two-bin heading branch
     iou: bool = False  # a branch that predicts the box's IoU, by which its score is multiplied
     score_threshold: float = 0.2
-    candidates: int = 1000  # best-scored anchors of a class that go into NMS
-    detections: int = 100  # most boxes a class reports
+    candidates: int = 1000  # highest-scoring anchors of a class that go into NMS
+    detections: int = 100  # maximum number of boxes reported per class
 
 
 @dataclass(frozen=True)
@@ -89,8 +89,8 @@ class LossConfig:
     vertical: float = 1.5
     direction: float = 0.2
     iou: float = 1.0
-    box: Literal["smooth_l1", "iou", "giou"] = "smooth_l1"  # what localization weighs: offsets, or 1 - IoU or GIoU
-    uncertainty: bool = False  # the weights are learnt, too (Kendall et al., CVPR 2018)
+    box: Literal["smooth_l1", "iou", "giou"] = "smooth_l1"  # box loss: of the offsets, or 1 - IoU or GIoU
+    uncertainty: bool = False  # learn the weights as well (Kendall et al., CVPR 2018)
     beta: float = 1.0  # error at which smooth L1 turns linear: metres for corners; SECOND's sigma of 3 is 1/9
 
 
@@ -109,7 +109,7 @@ class AugmentConfig:
 
 @dataclass(frozen=True)
 class SyntheticConfig:
-    """Generated scenes: made when no data folder is given."""
+    """Scenes generated when no data folder is given."""
 
     train_frames: int
     val_frames: int
@@ -128,14 +128,14 @@ class TrainConfig:
     decay_epochs: tuple[int, ...] = (40, 60)
     decay_ratio: float = 0.1
     cosine: bool = False  # after the warm-up half a cosine down to zero, instead of the steps at decay_epochs
-    repeat: int = 1  # times that an epoch goes through the frames, each time augmented anew
+    repeat: int = 1  # passes through the frames per epoch, each with new augmentation
     gradient_clip: float = 10.0  # largest norm of the gradient
     validate_every: int = 10  # epochs; the last epoch is always validated
     pictures: int = 4  # validation frames drawn
     workers: int = 0  # processes that read and augment
     bfloat16: bool = False  # backbone and heads in bfloat16; the encoder stays in float32
-    skip_corrupt: bool = False  # name a frame that cannot be read and take the next one, instead of stopping
-    skip_non_finite: bool = False  # note a step whose loss is not finite and leave it out, instead of stopping
+    skip_corrupt: bool = False  # report an unreadable frame and use the next one, instead of stopping
+    skip_non_finite: bool = False  # log and skip a step whose loss is not finite, instead of stopping
     train_split: str = "train"
     val_split: str = "val"
     seed: int = 0
@@ -143,7 +143,7 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that a run depends on but its data."""
+    """Everything that a run depends on, except its data."""
 
     head: HeadConfig
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
@@ -159,9 +159,9 @@ def load_config(
 ) -> Config:
     """Reads a YAML file and applies overrides such as "train.epochs=3".
 
-    A file with a key `base`, the path of another file from its own folder, holds only the differences to that one. They
-    are laid over it: mappings key by key; over the list of classes goes a mapping by their names; null takes a key or
-    a class away. With `replace_base`, (file, other), the other takes the file's place among the bases.
+    A file with a key `base`, the path of another file relative to its own folder, holds only the differences from that
+    file. They are merged into it: mappings key by key; the list of classes by a mapping with their names as keys; null
+    removes a key or a class. With `replace_base`, (file, other), `other` is read wherever `file` is a base.
 
     Raises InputError naming file and key.
     """
@@ -172,7 +172,7 @@ def load_config(
 
 
 def _read_chain(path: Path, replace_base: tuple[Path, Path] | None, seen: tuple[Path, ...]) -> dict[str, Any]:
-    """The tree of a file, laid over that of its base."""
+    """The tree of a file, merged into that of its base."""
     if replace_base is not None and path.resolve() == replace_base[0].resolve():
         return _read_chain(replace_base[1], None, ())
     if path.resolve() in seen:
@@ -184,7 +184,7 @@ def _read_chain(path: Path, replace_base: tuple[Path, Path] | None, seen: tuple[
     try:
         tree = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError) as error:  # ValueError: 2024-13-01 looks like a date
-        raise InputError(f"{path}: is no valid YAML: {' '.join(str(error).split())}") from error
+        raise InputError(f"{path}: is not valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(tree, dict):
         raise InputError(f"{path}: want a mapping with the keys {', '.join(_keys(Config))}")
     if "base" not in tree:
@@ -196,7 +196,7 @@ def _read_chain(path: Path, replace_base: tuple[Path, Path] | None, seen: tuple[
 
 
 def _merge(below: Any, above: Any, source: str, key: str) -> Any:
-    """The value `above` laid over the value `below` of a dotted key."""
+    """Merges the value `above` into the value `below` of a dotted key."""
     if not isinstance(above, dict):
         return above
     if isinstance(below, list) and all(isinstance(entry, dict) and "name" in entry for entry in below):
@@ -253,7 +253,7 @@ def _override(tree: dict[str, Any], override: str) -> None:
     try:
         node[last] = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError) as error:
-        raise InputError(f"--set {override}: {text!r} is no valid YAML value") from error
+        raise InputError(f"--set {override}: {text!r} is not a valid YAML value") from error
 
 
 def _keys(kind: Any) -> list[str]:
@@ -407,7 +407,7 @@ def _check_encoder(encoder: EncoderConfig, want: Callable[[bool, str, str, objec
     cells = math.prod((b - a) / v for a, b, v in zip(low, high, finest, strict=False))
     wanted = f"at most {MAX_CELLS} cells in the finest projection"
     want(cells <= MAX_CELLS, "encoder.voxel_size", wanted, f"{cells:.3g}")
-    wanted = "a point_limit beside it"
+    wanted = "a point_limit with it"
     want(encoder.voxel_limit == 0 or encoder.point_limit > 0, "encoder.voxel_limit", wanted, "none")
     if encoder.vfe == "pillar":
         for key in ("feature_scales", "projection_scales"):

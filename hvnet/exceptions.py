@@ -1,4 +1,4 @@
-"""What a caller may have to catch."""
+"""Exceptions that a caller may want to catch."""
 
 
 class InputError(ValueError):

@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None) -> None:
     add_checkpoint(parser)
     parser.add_argument("--features", action="store_true", help="draw pseudo-images, too, as NAME-features")
     parser.add_argument(
-        "--compare", type=Path, metavar="FILE", help="a second checkpoint, whose pseudo-images stand beside"
+        "--compare", type=Path, metavar="FILE", help="a second checkpoint, to compare pseudo-images with"
     )
     parser.add_argument("--colour", choices=get_args(Colour), default="height", help="of the points (default: height)")
     parser.add_argument("--out", type=Path, default=Path("figures"), metavar="DIR", help="(default: figures)")

@@ -14,7 +14,7 @@ def main(arguments: Sequence[str] | None) -> None:
     """The command."""
     parser = make_parser(
         "study",
-        "Runs a study of the paper: trains its rows and writes a table beside the paper's figures (.md), all rows "
+        "Runs a study of the paper: trains its rows and writes a table next to the paper's figures (.md), all rows "
         "(.csv) and a picture (.png). What is done already is kept, so that a study can be stopped and begun again "
         "with the same command.",
         [

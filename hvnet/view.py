@@ -20,16 +20,16 @@ DEMO_FRAMES = 4
 
 
 def choose_data(given: Path | None, root: Path | None, checkpoint: Path | None) -> tuple[Path | None, Path | None]:
-    """The clouds, None for generated scenes, and the checkpoint, None for the package's, of the input that was given.
+    """The clouds, None for generated scenes, and the checkpoint, None for the package's, of the given input.
 
-    Raises InputError for options that do not go together.
+    Raises InputError for options that exclude each other.
     """
     if given is not None and (given / "checkpoint.pt").is_file():
         if checkpoint is not None:
             raise InputError(f"--checkpoint: the run {given} has its own; leave one of them out")
         return root or find_run(given).root, given / "checkpoint.pt"
     if root is not None:
-        raise InputError("--data: goes with the folder of a run, which holds checkpoint.pt; give the root as INPUT")
+        raise InputError("--data: only for the folder of a run, which holds checkpoint.pt; give the root as INPUT")
     return given, checkpoint
 
 
@@ -57,8 +57,8 @@ def main(arguments: Sequence[str] | None) -> None:
     add_checkpoint(parser)
     parser.add_argument("--data", type=Path, metavar="DIR", help="for a run: a KITTI root (default: that of the run)")
     parser.add_argument("--split", metavar="NAME", help="frames of ImageSets/NAME.txt of a KITTI root (default: all)")
-    parser.add_argument("--port", type=int, default=8080, metavar="N", help="or the next that is free (default: 8080)")
-    parser.add_argument("--host", default="127.0.0.1", metavar="NAME", help="address to listen at (default: 127.0.0.1)")
+    parser.add_argument("--port", type=int, default=8080, metavar="N", help="or the next free port (default: 8080)")
+    parser.add_argument("--host", default="127.0.0.1", metavar="NAME", help="address to listen on (default: 127.0.0.1)")
     add_device(parser)
     options = parser.parse_args(arguments)
 

@@ -27,9 +27,13 @@ def test_a_run_is_found_by_its_folder_or_its_checkpoint(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "content", "message"),
     [
-        ("metrics.jsonl", b'{"epoch": 1}\n{"loss": 2}\n', "metrics.jsonl:2: no record of hvnet.train; remove the line"),
-        ("metrics.jsonl", b"[1]\n", "metrics.jsonl:1: no record of hvnet.train; remove the line"),
-        ("data.txt", b"\xff\xfe\x00", "data.txt: is no text that names a KITTI root; remove it, and give --data"),
+        (
+            "metrics.jsonl",
+            b'{"epoch": 1}\n{"loss": 2}\n',
+            "metrics.jsonl:2: not a record of hvnet.train; remove the line",
+        ),
+        ("metrics.jsonl", b"[1]\n", "metrics.jsonl:1: not a record of hvnet.train; remove the line"),
+        ("data.txt", b"\xff\xfe\x00", "data.txt: does not hold the path of a KITTI root; remove it and give --data"),
     ],
 )
 def test_damaged_files_are_named(file: str, content: bytes, message: str, tmp_path: Path) -> None:
@@ -60,5 +64,5 @@ def test_folders_to_begin_and_to_go_on(tmp_path: Path) -> None:
 def test_room(demo: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     check_room(tmp_path / "a" / "b", HVNet(demo))
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=10**6))
-    with pytest.raises(InputError, match=r"1 MB free, the run wants \d+ MB; free some, or give another --out"):
+    with pytest.raises(InputError, match=r"1 MB free, the run needs \d+ MB; free some, or give another --out"):
         check_room(tmp_path / "a" / "b", HVNet(demo))

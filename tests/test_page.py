@@ -181,10 +181,10 @@ def test_descriptions() -> None:
         (["{checkpoint}"], "does not name the data that it was trained on; give a KITTI root with --data"),
         (["{run}", "--data", "{empty}"], "val.txt: no such file"),
         (["{run}", "--out", "{empty}"], "is a folder; --out names the page"),
-        (["{binary}"], "data.txt: is no text that names a KITTI root"),
-        (["{shallow}", "--data", "{empty}"], "metrics.jsonl:1: no record of hvnet.train; remove the line"),
+        (["{binary}"], "data.txt: does not hold the path of a KITTI root"),
+        (["{shallow}", "--data", "{empty}"], "metrics.jsonl:1: not a record of hvnet.train; remove the line"),
         (["{run}", "--out", "{run}/checkpoint.pt/x.html"], "checkpoint.pt: no folder; --out names the page"),
-        (["{broken}", "--data", "{empty}"], "metrics.jsonl:2: no record of hvnet.train; remove the line"),
+        (["{broken}", "--data", "{empty}"], "metrics.jsonl:2: not a record of hvnet.train; remove the line"),
     ],
 )
 def test_mistakes_of_the_user(run: Path, tmp_path: Path, arguments: list[str], message: str) -> None:

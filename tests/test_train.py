@@ -391,7 +391,7 @@ def test_a_disk_without_room_is_found_before_the_run(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=10**6))
-    with pytest.raises(InputError, match=r"1 MB free, the run wants \d+ MB; free some, or give another --out"):
+    with pytest.raises(InputError, match=r"1 MB free, the run needs \d+ MB; free some, or give another --out"):
         run(scenes, tmp_path / "new" / "out")
     assert not (tmp_path / "new").exists()
 

@@ -87,7 +87,7 @@ def object_points(database: Database) -> Tensor:
 def build_database(frames: Frames, wanted: Sequence[int] | None = None) -> Database:
     """Cuts every labelled object out of these frames, or those of them that are wanted.
 
-    An object's points are those in or on its box, of the whole cloud: a truncated one has points beside the image.
+    An object's points are those in or on its box, of the whole cloud: a truncated one has points outside the image.
     The database keeps numbers of frames: their names in a KITTI root, whose database is a file, else their places.
     Raises InputError for a name in a KITTI root that is no number.
     """

@@ -94,7 +94,7 @@ def evaluate(
 
 
 def _median_length(candidates: Candidates, name: str) -> float:
-    """Of the labelled objects of a class, of the detections where there are none; metres."""
+    """From the labelled objects of a class, or from the detections if there are none; metres."""
     for rows in (candidates.truths, candidates.detections):
         lengths = rows.dimensions[rows.name == name, 2]
         if (lengths > 0).any():
@@ -225,7 +225,7 @@ def _best_score(curves: Sequence[Counts]) -> float:
 def _report(
     candidates: Candidates, matchings: Sequence[Matching], threshold: float, points: Integers | None
 ) -> dict[str, Any]:
-    """What is missed and what is found wrongly when the detections below a score are dropped."""
+    """Misses and false positives when the detections below a score are dropped."""
     counts: dict[str, list[int]] = {"ground_truths": [], "misses": [], "false_positives": []}
     distance = candidates.truths.ground_distance()
     groups = {"recall_by_distance": {band: _between(distance, limits) for band, limits in DISTANCES.items()}}
@@ -255,7 +255,7 @@ def _between(values: NDArray, limits: tuple[float, float]) -> Mask:
 
 
 def _warnings(truths: Labels, detections: Labels, levels: Sequence[Level], counts: Sequence[int]) -> list[str]:
-    """What a reader of the figures has to know; truths and detections are those of the class."""
+    """Warnings for readers of the figures; truths and detections are those of the class."""
     warnings = []
     if any(level.min_height > 0 for level in levels):
         for objects, kind in ((truths, "label"), (detections, "detection")):
@@ -267,7 +267,7 @@ def _warnings(truths: Labels, detections: Labels, levels: Sequence[Level], count
             warnings.append(f"{of} no 2D box, as these levels ask: see hvnet.evaluate --no-2d-filter")
     for level, total in zip(levels, counts, strict=True):
         if 0 < total <= RECALL_STEPS:
-            # one threshold a ground truth at most, the first of which stands at recall 0
+            # at most one threshold per ground truth, and the first is at recall 0
             best = (100 * (total - 1) / RECALL_STEPS, 100 * math.ceil(total / 4) / 11)
             warnings.append(
                 f"{level.name}: {total} ground truths cap R40 at {best[0]:.2f} and R11 at {best[1]:.2f}: read 'exact'"

@@ -1,4 +1,4 @@
-"""A detector on frames of any format: what it finds, and how good that is."""
+"""Runs a detector on frames of any format and scores what it finds."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -81,7 +81,7 @@ def labels_in_range(frame: Frame, config: Config) -> Labels:
 
 
 def background_note(names: Iterable[str], classes: Iterable[str]) -> str:
-    """How many of the labels have a class that is not among these, for people; empty if all have."""
+    """A message that counts the labels of classes that are not among these; empty if there are none."""
     counts = Counter(names)
     others = {name: count for name, count in counts.most_common() if name not in set(classes) | {DONTCARE}}
     if not others:

@@ -1,6 +1,6 @@
 """A trained model for other programs.
 
-backbone_heads.onnx holds what lies between the pseudo-images and the maps of the heads, in standard operators.
+backbone_heads.onnx holds everything between the pseudo-images and the maps of the heads, in standard operators.
 detector.pt2 holds encoder, backbone and heads as one program of torch.export, with the kernels as custom ops: it takes
 points. Both end at the maps, whose size is fixed; meta.json says what decoding them and NMS need. docs/deploy.md has
 worked examples.

@@ -114,7 +114,7 @@ def mistake_line(mistake: Mistake) -> str:
 
 
 def paragraph(*lines: str) -> str:
-    """HTML of lines of text, as small as what stands beside the controls."""
+    """HTML of lines of text, as small as the labels of the controls."""
     text = "<br>".join(html.escape(line) for line in lines)
     return f'<div style="font-size: 0.8em; padding: 0.2em 1em">{text}</div>'
 

@@ -42,7 +42,7 @@ def short_table(study: Study, outcomes: Sequence[Outcome], times: dict[str, Time
 
 
 def agreement(outcomes: Sequence[Outcome]) -> tuple[int, int, float]:
-    """Of how many pairs of rows all seeds agree which is better, of how many pairs, and how far the seeds of a row are
+    """On how many pairs of rows all seeds agree, out of how many pairs, and how far the seeds of a row are
     apart in the median, in points of mAP."""
     of_row: dict[str, dict[int, float]] = {}
     seen: set[Path] = set()
@@ -98,7 +98,7 @@ def trained_table(study: Study, outcomes: Sequence[Outcome], times: dict[str, Ti
 
 
 def speed_table(study: Study, times: dict[str, Times], device: str) -> list[str]:
-    """The Markdown table of the study of speed: this device beside the paper's."""
+    """The Markdown table of the study of speed: this device next to the paper's."""
     lines = [
         f"| row | RTX 2080 Ti (the paper's), ms | {device}, ms | " + " | ".join(STAGES) + " |",
         "| --- |" + " ---: |" * (2 + len(STAGES)),

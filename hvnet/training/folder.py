@@ -10,14 +10,14 @@ from hvnet.folders import check_empty
 from hvnet.network.model import HVNet
 
 ROOM = 100 * 2**20
-"""Bytes beside the checkpoints that a run may need on the disk."""
+"""Bytes that a run may need on the disk in addition to the checkpoints."""
 
 
 class RunFolder(NamedTuple):
-    """What there is of a training run."""
+    """The files found of a training run."""
 
     checkpoint: Path
-    metrics: list[dict[str, Any]]  # a record an epoch, none where there is no metrics.jsonl
+    metrics: list[dict[str, Any]]  # one record per epoch; empty if there is no metrics.jsonl
     root: Path | None  # the KITTI root that it was trained on, if the run says so
 
 
@@ -32,7 +32,7 @@ def find_run(path: Path) -> RunFolder:
     try:
         named = data.read_text(encoding="utf-8").strip() if data.is_file() else ""
     except UnicodeDecodeError as error:
-        raise InputError(f"{data}: is no text that names a KITTI root; remove it, and give --data") from error
+        raise InputError(f"{data}: does not hold the path of a KITTI root; remove it and give --data") from error
     root = Path(named) if named else None
     return RunFolder(checkpoint, _read_metrics(checkpoint.parent / "metrics.jsonl"), root)
 
@@ -47,17 +47,17 @@ def _read_metrics(path: Path) -> list[dict[str, Any]]:
             for table in record.get("validation", {}).values():
                 table["exact"]
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InputError(f"{path}:{number}: no record of hvnet.train; remove the line") from error
+            raise InputError(f"{path}:{number}: not a record of hvnet.train; remove the line") from error
         records.append(record)
     return records
 
 
 def check_folder(out: Path, resume: bool) -> None:
-    """Raises InputError unless a run can be begun in the folder `out` or, with `resume`, taken up there."""
+    """Raises InputError unless a run can start in the folder `out` or, with `resume`, continue there."""
     if resume and not (out / "checkpoint.pt").is_file():
         raise InputError(f"{out}: holds no checkpoint.pt to resume; give the run's folder with --out, or no --resume")
     if not resume:
-        check_empty(out, "give another --out, or --resume to go on with the run in it")
+        check_empty(out, "give another --out, or --resume to continue the run in it")
 
 
 def check_room(out: Path, model: HVNet) -> None:
@@ -67,5 +67,5 @@ def check_room(out: Path, model: HVNet) -> None:
     wanted = 2 * 3 * sum(weight.numel() * weight.element_size() for weight in model.parameters()) + ROOM
     if free < wanted:
         raise InputError(
-            f"{folder}: {free / 1e6:.0f} MB free, the run wants {wanted / 1e6:.0f} MB; free some, or give another --out"
+            f"{folder}: {free / 1e6:.0f} MB free, the run needs {wanted / 1e6:.0f} MB; free some, or give another --out"
         )
