@@ -84,7 +84,7 @@ figcaption { margin-top: .3em }
 
 <h2>Training</h2>
 {% if curves %}<img alt="losses and validation AP by epoch" src="{{ curves }}">
-{% else %}<p>There is no metrics.jsonl next to the checkpoint.</p>{% endif %}
+{% else %}<p>No metrics.jsonl next to the checkpoint.</p>{% endif %}
 
 <p>In every picture: <span class="key" style="background: {{ truth_colour }}"></span>labelled
 {%- for name, colour in colours %}<span class="key" style="background: {{ colour }}"></span>{{ name }} detected
