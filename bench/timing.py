@@ -37,7 +37,7 @@ Run = Callable[[], object]
 
 
 class Work(NamedTuple):
-    """The least that a computation must move and calculate, whoever does it."""
+    """The least that any implementation of a computation must move and calculate."""
 
     bytes: float
     operations: float = 0.0
@@ -239,7 +239,7 @@ def agree_in_norm(what: str, got: Sequence[Tensor], want: Sequence[Tensor], tole
 
 
 def skipped(provider: str, reason: str) -> None:
-    """One line for a provider that cannot take part."""
+    """One line for a provider that cannot run here."""
     print(f"skipped: {provider}: {' '.join(reason.split())[:200]}")
 
 
@@ -293,7 +293,7 @@ def start(name: str, args: argparse.Namespace) -> Bench:
 def read_scene(file: Path | None) -> Tensor:
     """Points (N, 4) float32 of a velodyne .bin, cropped to what the camera sees; without a file, of a generated scene.
 
-    Where there is no calibration in KITTI's layout beside the file, the view is taken to be x > 0, |y| < x.
+    Where there is no calibration in KITTI's layout next to the file, the view is assumed to be x > 0, |y| < x.
     """
     if file is None:
         return torch.from_numpy(make_frame(0, 0, Options(azimuth=41))[1].points)

@@ -302,7 +302,7 @@ def twin_stages(setting: Setting, name: str, points: Tensor, voxels: dict[Grid, 
 
 
 def fused_stages(setting: Setting, points: Tensor, sample: Tensor) -> Stages:
-    """The two steps of FusedEncoder; the points stand in the index's order."""
+    """The two steps of FusedEncoder; the points are in the index's order."""
     encoder = setting.fused()
     indexed = encoder.index(points, sample)
     feature_grids, projection_grids = setting.encoder.feature_grids, setting.encoder.projection_grids
@@ -329,7 +329,7 @@ def fused_stages(setting: Setting, points: Tensor, sample: Tensor) -> Stages:
 
 
 def bench_layers(bench: Bench, setting: Setting, points: Tensor, sample: Tensor, counts: Counts) -> None:
-    """Knowledge, AVFE and AVFEO, each from the same inputs; the index is given and the points stand in its order."""
+    """Knowledge, AVFE and AVFEO, each from the same inputs; the index is given and the points are in its order."""
     index = voxel_index(points, sample, 1, setting.grids)
     points, sample = points[index.order], sample[index.order]
     voxels = dict(zip(setting.grids, index.scales, strict=True))
@@ -428,7 +428,7 @@ def encoders(setting: Setting, inputs: Inputs, training: bool, compile: bool) ->
 
 
 def bench_encoder(bench: Bench, setting: Setting, inputs: Inputs, counts: Counts, compile: bool) -> None:
-    """The whole encoder, and beside it the smaller one of PointPillars, which calculates something else."""
+    """The whole encoder, and for comparison the smaller one of PointPillars, which calculates something else."""
     for training in (False, True):
         compare(bench, "encoder", encoders(setting, inputs, training, compile), counts.encoder, training)
         pillars = PillarEncoder(setting.encoder.projection_grids[0]).to(setting.device).train(training)
@@ -449,7 +449,7 @@ def choose(setting: Setting, inputs: Inputs) -> None:
         setting.dense[name] = seconds[True] < seconds[False]
         print(
             f"{name}: torch.unique at every scale {1e3 * seconds[False]:.0f} ms, dense over the grid "
-            f"{1e3 * seconds[True]:.0f} ms: the {'dense' if setting.dense[name] else 'compact'} one takes part"
+            f"{1e3 * seconds[True]:.0f} ms: the {'dense' if setting.dense[name] else 'compact'} one is compared"
         )
 
 

@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 __all__ = ["Detector", "InputError", "__version__", "load"]
 __version__ = "0.2.0"
 
-if not TYPE_CHECKING:  # a type checker would take any name for good
+if not TYPE_CHECKING:  # a type checker would accept any name
 
     def __getattr__(name: str) -> object:
-        """On first use, so that importing the kernels does not load the network."""
+        """Lazy, so that importing the kernels does not load the network."""
         if name in ("load", "Detector"):
             from hvnet.network import detector
 

@@ -38,7 +38,7 @@ def add_device(parser: argparse.ArgumentParser) -> None:
 def add_checkpoint(parser: argparse.ArgumentParser) -> None:
     """The option --checkpoint."""
     parser.add_argument(
-        "--checkpoint", type=Path, metavar="FILE", help="of python -m hvnet.train (default: the weights of the package)"
+        "--checkpoint", type=Path, metavar="FILE", help="from hvnet.train (default: the weights of the package)"
     )
 
 
@@ -54,7 +54,7 @@ def add_overlaps(parser: argparse.ArgumentParser) -> None:
 
 
 def read_overlaps(given: Sequence[str], classes: Sequence[str]) -> dict[str, float]:
-    """The values of --overlap by class. Raises InputError for a class that is not there, or no overlap."""
+    """The values of --overlap by class. Raises InputError for an unknown class or an invalid overlap."""
     overlaps = {}
     for text in given:
         name, _, number = text.rpartition("=")
@@ -76,15 +76,15 @@ def add_changes(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 def run_command(main: Callable[[Sequence[str] | None], None]) -> None:
-    """Runs a command's main: a user's mistake, or a file that fails, ends it with one line and exit code 2,
-    a signal with 128 and its number."""
+    """Runs a command's main: a user's mistake or a failing file ends it with one line and exit code 2,
+    a signal with exit code 128 plus its number."""
     try:
         main(None)
     except (InputError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     except Stopped as stop:
-        if str(stop):  # the first of several ranks speaks
+        if str(stop):  # empty on all ranks but the first
             print(stop, flush=True)
         sys.exit(128 + stop.signal)
     except KeyboardInterrupt:

@@ -1,5 +1,5 @@
 """The configuration: a tree of frozen dataclasses, read from YAML. Unknown keys, wrong types and impossible values
-are refused with the dotted key. Defaults are the paper's (Sec. 4.1), see configs/hvnet.yaml."""
+are rejected with the dotted key. Defaults are the paper's (Sec. 4.1), see configs/hvnet.yaml."""
 
 import dataclasses
 import itertools
@@ -36,13 +36,13 @@ class EncoderConfig:
     # AVFE and AVFEO; VoxelNet's VFE layers in their place; or one layer of PointPillars' features
     vfe: Literal["attentive", "plain", "pillar"] = "attentive"
     attention_relu: bool = False  # a ReLU before the product of the AVFE layers
-    point_limit: int = 0  # hard voxels: most points of a voxel of voxel_size, the others are dropped; 0 is no limit
-    voxel_limit: int = 0  # most such voxels of a sample
+    point_limit: int = 0  # hard voxels: maximum points per voxel of voxel_size, the others are dropped; 0: no limit
+    voxel_limit: int = 0  # maximum number of such voxels per sample
 
 
 @dataclass(frozen=True)
 class BackboneConfig:
-    """Main stream and pyramid: one width and one number of layers a block; further blocks are like the last named."""
+    """Main stream and pyramid: one width and one number of layers per block; further blocks repeat the last entry."""
 
     widths: tuple[int, ...] = (64, 128, 256)
     layers: tuple[int, ...] = (3, 5, 5)
@@ -64,7 +64,7 @@ class ClassConfig:
     focal_alpha: float
     focal_gamma: float
     nms_iou: float
-    overlap: float | None = None  # with a label that a detection has to reach in the evaluation; default: by size
+    overlap: float | None = None  # IoU with a label that a detection needs in the evaluation; default: by size
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,8 @@ class HeadConfig:
     direction: bool = False  # the two-bin heading branch
     iou: bool = False  # a branch that predicts the box's IoU, by which its score is multiplied
     score_threshold: float = 0.2
-    candidates: int = 1000  # best-scored anchors of a class that go into NMS
-    detections: int = 100  # most boxes a class reports
+    candidates: int = 1000  # highest-scoring anchors of a class that go into NMS
+    detections: int = 100  # maximum number of boxes reported per class
 
 
 @dataclass(frozen=True)
@@ -89,8 +89,8 @@ class LossConfig:
     vertical: float = 1.5
     direction: float = 0.2
     iou: float = 1.0
-    box: Literal["smooth_l1", "iou", "giou"] = "smooth_l1"  # what localization weighs: offsets, or 1 - IoU or GIoU
-    uncertainty: bool = False  # the weights are learnt, too (Kendall et al., CVPR 2018)
+    box: Literal["smooth_l1", "iou", "giou"] = "smooth_l1"  # box loss: of the offsets, or 1 - IoU or GIoU
+    uncertainty: bool = False  # learn the weights as well (Kendall et al., CVPR 2018)
     beta: float = 1.0  # error at which smooth L1 turns linear: metres for corners; SECOND's sigma of 3 is 1/9
 
 
@@ -109,7 +109,7 @@ class AugmentConfig:
 
 @dataclass(frozen=True)
 class SyntheticConfig:
-    """Generated scenes: made when no data folder is given."""
+    """Scenes generated when no data folder is given."""
 
     train_frames: int
     val_frames: int
@@ -134,8 +134,8 @@ class TrainConfig:
     pictures: int = 4  # validation frames drawn
     workers: int = 0  # processes that read and augment
     bfloat16: bool = False  # backbone and heads in bfloat16; the encoder stays in float32
-    skip_corrupt: bool = False  # name a frame that cannot be read and take the next one, instead of stopping
-    skip_non_finite: bool = False  # note a step whose loss is not finite and leave it out, instead of stopping
+    skip_corrupt: bool = False  # report an unreadable frame and use the next one, instead of stopping
+    skip_non_finite: bool = False  # log and skip a step whose loss is not finite, instead of stopping
     train_split: str = "train"
     val_split: str = "val"
     seed: int = 0
@@ -143,7 +143,7 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that a run depends on but its data."""
+    """Everything that a run depends on, except its data."""
 
     head: HeadConfig
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
@@ -184,7 +184,7 @@ def _read_chain(path: Path, replace_base: tuple[Path, Path] | None, seen: tuple[
     try:
         tree = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError) as error:  # ValueError: 2024-13-01 looks like a date
-        raise InputError(f"{path}: is no valid YAML: {' '.join(str(error).split())}") from error
+        raise InputError(f"{path}: is not valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(tree, dict):
         raise InputError(f"{path}: want a mapping with the keys {', '.join(_keys(Config))}")
     if "base" not in tree:
@@ -253,7 +253,7 @@ def _override(tree: dict[str, Any], override: str) -> None:
     try:
         node[last] = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError) as error:
-        raise InputError(f"--set {override}: {text!r} is no valid YAML value") from error
+        raise InputError(f"--set {override}: {text!r} is not a valid YAML value") from error
 
 
 def _keys(kind: Any) -> list[str]:
@@ -408,7 +408,7 @@ def _check_encoder(encoder: EncoderConfig, want: Callable[[bool, str, str, objec
     cells = math.prod((b - a) / v for a, b, v in zip(low, high, finest, strict=False))
     wanted = f"at most {MAX_CELLS} cells in the finest projection"
     want(cells <= MAX_CELLS, "encoder.voxel_size", wanted, f"{cells:.3g}")
-    wanted = "a point_limit beside it"
+    wanted = "a point_limit with it"
     want(encoder.voxel_limit == 0 or encoder.point_limit > 0, "encoder.voxel_limit", wanted, "none")
     if encoder.vfe == "pillar":
         for key in ("feature_scales", "projection_scales"):

@@ -32,9 +32,9 @@ def main(arguments: Sequence[str] | None) -> None:
     """The command."""
     parser = make_parser(
         "train",
-        "Trains HVNet, validates it as KITTI does, and writes checkpoint.pt, metrics.jsonl, tensorboard/, pictures/ "
-        "and data.txt (where the data are) to the run's folder. To train on 8 GPUs, put torchrun --nproc-per-node 8 "
-        "in the place of python.",
+        "Trains HVNet, validates it by KITTI's protocol, and writes checkpoint.pt, metrics.jsonl, tensorboard/, "
+        "pictures/ and data.txt (the path of the data) to the run's folder. To train on 8 GPUs, replace python with "
+        "torchrun --nproc-per-node 8.",
         [
             "",
             "--config configs/compact.yaml --data /data/kitti --set train.batch_size=2",
@@ -42,9 +42,9 @@ def main(arguments: Sequence[str] | None) -> None:
         ],
     )
     parser.add_argument("--config", type=Path, default=DEMO, metavar="FILE", help="YAML (default: configs/demo.yaml)")
-    parser.add_argument("--data", type=Path, metavar="DIR", help="a KITTI root (default: scenes are generated)")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="a KITTI root (default: generate scenes)")
     parser.add_argument("--out", metavar="DIR", help="folder of the run (default: runs/NAME of the config)")
-    parser.add_argument("--resume", action="store_true", help="go on with the run in --out (default: the latest)")
+    parser.add_argument("--resume", action="store_true", help="continue the run in --out (default: the latest)")
     add_device(parser)
     add_changes(parser, "override a config value, such as train.epochs=3")
     options = parser.parse_args(arguments)
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None) -> None:
             raise InputError(f"{options.config}: has no key synthetic, so it needs --data with a KITTI root")
         root = ranks.broadcast(generated_scenes(config, out.parent) if ranks.rank() == 0 else None)
     Run(config, kitti_data(root, config), out, device, resume=options.resume).train()
-    ranks.stop()  # not after an error: the others are still at work, and torchrun ends them
+    ranks.stop()  # not after an error: the other ranks are still working, and torchrun ends them
 
 
 if __name__ == "__main__":

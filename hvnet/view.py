@@ -21,16 +21,16 @@ DEMO_FRAMES = 4
 
 
 def choose_data(given: Path | None, root: Path | None, checkpoint: Path | None) -> tuple[Path | None, Path | None]:
-    """The clouds, None for generated scenes, and the checkpoint, None for the package's, of the input that was given.
+    """The clouds, None for generated scenes, and the checkpoint, None for the package's, of the given input.
 
-    Raises InputError for options that do not go together.
+    Raises InputError for options that exclude each other.
     """
     if given is not None and (given / "checkpoint.pt").is_file():
         if checkpoint is not None:
             raise InputError(f"--checkpoint: the run {given} has its own; leave one of them out")
         return root or find_run(given).root, given / "checkpoint.pt"
     if root is not None:
-        raise InputError("--data: goes with the folder of a run, which holds checkpoint.pt; give the root as INPUT")
+        raise InputError("--data: only for the folder of a run, which holds checkpoint.pt; give the root as INPUT")
     return given, checkpoint
 
 

@@ -616,7 +616,7 @@ _column_sums.register_autograd(_column_sums_backward, setup_context=_save_rows)
 def _write_image(features: Tensor, cursor: Tensor, cells: int) -> Tensor:
     shape = (cells, features.shape[1])
     if features.device.type == "cpu":
-        # from calloc: a page that no voxel lies in is never written, and most are such
+        # from calloc: most pages hold no voxel and are never written
         image = torch.from_numpy(np.zeros(shape, dtype=np.float32 if features.dtype == torch.float32 else np.float64))
     else:
         image = features.new_zeros(shape)

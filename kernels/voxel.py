@@ -323,7 +323,7 @@ def _cursor_kernel(
 
 @wp.func
 def _interleave(x: wp.int64, y: wp.int64):
-    """The Morton code of two values of 16 bits: both are spread at once, each in its half of the word."""
+    """The Morton code of two values of 16 bits: both are spread together, each in its half of the word."""
     v = (x << wp.int64(32)) | y
     v = (v | (v << wp.int64(8))) & wp.int64(0x00FF00FF00FF00FF)
     v = (v | (v << wp.int64(4))) & wp.int64(0x0F0F0F0F0F0F0F0F)

@@ -60,7 +60,7 @@ def test_without_reflectance_it_is_0_and_a_note_says_so(tmp_path: Path, kind: st
     read, notes = read_cloud(path)
     assert read.shape == (60, 4)
     assert (read[:, 3] == 0).all()
-    assert notes == [f"{path}: has no reflectance; 0 was taken, and detection suffers from it"]
+    assert notes == [f"{path}: has no reflectance; 0 is used, which makes detection worse"]
 
 
 @pytest.mark.parametrize(("highest", "divisor"), [(1, 1), (1.5, 255), (120, 255), (255, 255), (256, 65535), (1e6, 1e6)])

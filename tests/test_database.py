@@ -22,11 +22,11 @@ def test_command(copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
     printed = capsys.readouterr().out
     assert f"{path}: {len(built)} objects, {len(built.reflectance)} points\n" in printed
     assert f"{(built.name == 'Car').sum():8d} Car\n" in printed
-    with pytest.raises(InputError, match=re.escape(f"{path}: exists already")):
+    with pytest.raises(InputError, match=re.escape(f"{path}: already exists")):
         main(["--data", str(root)])
     main(["--data", str(root), "--split", "val", "--out", str(root / "val.npz")])
     assert set(read_database(root / "val.npz").frame.tolist()) == {4, 5}
-    with pytest.raises(InputError, match=re.escape(f"{root / 'none'}: no folder that can be written")):
+    with pytest.raises(InputError, match=re.escape(f"{root / 'none'}: not a writable folder")):
         main(["--data", str(root), "--out", str(root / "none" / "a.npz")])
     with pytest.raises(InputError, match=r"test\.txt: no such file"):
         main(["--data", str(root), "--split", "test", "--out", str(root / "b.npz")])

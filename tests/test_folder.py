@@ -27,9 +27,13 @@ def test_a_run_is_found_by_its_folder_or_its_checkpoint(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "content", "message"),
     [
-        ("metrics.jsonl", b'{"epoch": 1}\n{"loss": 2}\n', "metrics.jsonl:2: no record of hvnet.train; remove the line"),
-        ("metrics.jsonl", b"[1]\n", "metrics.jsonl:1: no record of hvnet.train; remove the line"),
-        ("data.txt", b"\xff\xfe\x00", "data.txt: is no text that names a KITTI root; remove it, and give --data"),
+        (
+            "metrics.jsonl",
+            b'{"epoch": 1}\n{"loss": 2}\n',
+            "metrics.jsonl:2: not a record of hvnet.train; remove the line",
+        ),
+        ("metrics.jsonl", b"[1]\n", "metrics.jsonl:1: not a record of hvnet.train; remove the line"),
+        ("data.txt", b"\xff\xfe\x00", "data.txt: does not hold the path of a KITTI root; remove it and give --data"),
     ],
 )
 def test_damaged_files_are_named(file: str, content: bytes, message: str, tmp_path: Path) -> None:

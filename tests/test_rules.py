@@ -68,5 +68,5 @@ def test_rules_of_a_config(demo: Config) -> None:
 
 
 def test_an_overlap_of_no_class_is_refused(demo: Config) -> None:
-    with pytest.raises(ValueError, match="overlaps: Truck is none of the classes Car, Pedestrian, Cyclist"):
+    with pytest.raises(ValueError, match="overlaps: Truck is not one of the classes Car, Pedestrian, Cyclist"):
         config_rules(demo, {"Car": 0.5, "Truck": 0.5})

@@ -146,7 +146,7 @@ def test_a_study_that_is_stopped_goes_on(tmp_path: Path, scenes: Path) -> None:
     process.send_signal(signal.SIGTERM)
     out, _ = process.communicate(timeout=120)
     assert process.returncode == 128 + signal.SIGTERM
-    assert "stopped; the same command goes on from here" in out
+    assert "stopped; the same command continues from here" in out
     main([*given, "--out", str(tmp_path / "a")])
     main([*given, "--out", str(tmp_path / "b")])
     stopped, whole = (json.loads(next((tmp_path / at).glob("rows/*/result.json")).read_text()) for at in "ab")

@@ -82,7 +82,7 @@ def random_flip(points: Tensor, boxes: Tensor, probability: float, generator: Ge
 
 
 def random_rotation(points: Tensor, boxes: Tensor, limit: float, generator: Generator) -> tuple[Tensor, Tensor]:
-    """Turns all about the LiDAR's z axis by an angle uniform in [-limit, limit], radians."""
+    """Rotates everything about the LiDAR's z axis by an angle uniform in [-limit, limit], radians."""
     angle = _uniform(-limit, limit, generator)
     cos, sin = math.cos(angle), math.sin(angle)
     points, boxes = points.clone(), boxes.clone()
@@ -97,7 +97,7 @@ def random_rotation(points: Tensor, boxes: Tensor, limit: float, generator: Gene
 def random_scaling(
     points: Tensor, boxes: Tensor, limits: tuple[float, float], generator: Generator
 ) -> tuple[Tensor, Tensor]:
-    """Scales all about the LiDAR by a factor uniform between the limits."""
+    """Scales everything about the LiDAR by a factor uniform between the limits."""
     factor = _uniform(*limits, generator)
     points, boxes = points.clone(), boxes.clone()
     points[:, :3] *= factor
@@ -108,7 +108,7 @@ def random_scaling(
 def random_translation(
     points: Tensor, boxes: Tensor, deviation: tuple[float, float, float], generator: Generator
 ) -> tuple[Tensor, Tensor]:
-    """Moves all by a normal distribution of mean 0 and the given standard deviations along x, y and z, metres."""
+    """Moves everything by a normal sample with mean 0 and the given standard deviations along x, y and z, metres."""
     shift = torch.randn(3, generator=generator) * torch.tensor(deviation)
     points, boxes = points.clone(), boxes.clone()
     points[:, :3] += shift.to(points.device)
@@ -119,11 +119,11 @@ def random_translation(
 def mix_sectors(
     points: Tensor, boxes: Tensor, labels: Tensor, others: tuple[Tensor, Tensor, Tensor], generator: Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """All to one side of a direction is taken from another frame (points, boxes, labels), as PolarMix (Xiao et al.,
+    """Takes everything on one side of a direction from another frame (points, boxes, labels), as PolarMix (Xiao et al.,
     2022) swaps sectors of scans.
 
     The direction is uniform within 30 degrees of straight ahead. A box belongs to the side of its centre and keeps its
-    points beyond the border; there the points of the frame on that side give way.
+    points beyond the border, where they replace the points of the frame on that side.
     """
     border = _uniform(-math.pi / 6, math.pi / 6, generator)
     left_from_other = torch.rand((), generator=generator).item() < 0.5
@@ -142,7 +142,7 @@ def mix_sectors(
     from_own, from_new = within(others[0], own), within(others[0], new)
     stays = (in_own | (left(points) != left_from_other)) & ~(in_new & ~in_own)
     comes = (from_new | (left(others[0]) == left_from_other)) & ~(from_own & ~from_new)
-    # an object cut away on the other side must not stay behind as half of one
+    # half of an object that is removed with the other side must not stay behind
     stays &= ~within(points, boxes[~kept_boxes]) | in_own
     comes &= ~within(others[0], others[1][~other_boxes]) | from_new
     return torch.cat((points[stays], others[0][comes])), torch.cat((own, new)), torch.cat((own_labels, new_labels))
@@ -157,10 +157,10 @@ def sample_objects(
     generator: Generator,
     classes: Sequence[str],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Ground-truth sampling of SECOND: inserts objects of other frames, where they stood in these.
+    """Ground-truth sampling of SECOND: inserts objects of other frames at their original positions.
 
-    labels (M,) int64 number the boxes' classes in `classes`; boxes of any other number only block their place. Of each
-    class in `counts` so many objects are drawn, without replacement, that the frame has this count of them.
+    labels (M,) int64 number the boxes' classes in `classes`; boxes of any other number only block their place. For each
+    class in `counts`, objects are drawn without replacement until the frame has that many of them.
     """
     drawn: list[np.ndarray] = [np.empty(0, np.int64)]
     drawn_labels: list[int] = []
@@ -179,7 +179,7 @@ def sample_frame(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Inserts all objects of one frame of the database into points (N, 4), boxes (M, 7) and labels (M,).
 
-    They stand together as they did: a queue at a light, cars along a kerb. Those of other classes have label -1.
+    They keep their arrangement: a queue at a light, cars along a kerb. Those of other classes have label -1.
     """
     drawn = objects.of_frame[int(torch.randint(len(objects.of_frame), (), generator=generator))]
     drawn_labels = [classes.index(name) if name in classes else -1 for name in objects.database.name[drawn]]

@@ -1,4 +1,4 @@
-"""Point clouds of one's own: .bin (KITTI), .npy, .pcd and .ply files as (N, 4) float32."""
+"""Users' own point clouds: .bin (KITTI), .npy, .pcd and .ply files as (N, 4) float32."""
 
 import struct
 import tokenize
@@ -19,7 +19,7 @@ REFLECTANCE = ("reflectance", "intensity", "reflectivity", "i", "scalar_intensit
 
 
 def read_cloud(path: Path) -> tuple[NDArray[np.float32], list[str]]:
-    """Points (N, 4) x, y, z in metres and reflectance in [0, 1] of a file, and what was changed in reading them.
+    """Points (N, 4) x, y, z in metres and reflectance in [0, 1] of a file, and notes on what was changed while reading.
 
     A file without reflectance gets 0, one that counts it beyond 1 is divided by 255 or, if that is too little, by
     65535; points that are not finite are dropped. Raises InputError naming the file.
@@ -36,7 +36,7 @@ def read_cloud(path: Path) -> tuple[NDArray[np.float32], list[str]]:
     notes = [f"{path}: {dropped} points that are not finite were dropped"] if dropped else []
     if points.shape[1] == 3:
         points = np.concatenate((points, np.zeros_like(points[:, :1])), axis=1)
-        notes.append(f"{path}: has no reflectance; 0 was taken, and detection suffers from it")
+        notes.append(f"{path}: has no reflectance; 0 is used, which makes detection worse")
     highest = float(points[:, 3].max(initial=0))
     if highest > 1:
         scale = next((full for full in (255.0, 65535.0) if highest <= full), highest)  # 8 bits, 16 bits, else unknown
@@ -47,7 +47,7 @@ def read_cloud(path: Path) -> tuple[NDArray[np.float32], list[str]]:
 
 def _read_npy(path: Path) -> NDArray[np.float32]:
     try:
-        with path.open("rb") as file:  # np.load would take other formats, too
+        with path.open("rb") as file:  # np.load would also accept other formats
             points = np.lib.format.read_array(file, allow_pickle=False)
     except (OSError, ValueError, MemoryError, tokenize.TokenError) as error:
         raise InputError(f"{path}: cannot be read as .npy ({error}); save it with numpy.save") from error

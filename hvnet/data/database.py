@@ -17,7 +17,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = make_parser(
         "data.database",
         "Cuts every labelled object out of a KITTI split: the ground-truth database for augmentation. Training builds "
-        "it by itself where the root holds none.",
+        "it by itself if the root has none.",
         ["--data /data/kitti", "--data /data/kitti --split trainval --out trainval.npz"],
     )
     parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="a KITTI root")
@@ -26,9 +26,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     out: Path = options.out or options.data / FILE_NAME
     if out.exists():
-        raise InputError(f"{out}: exists already; remove it or name another file with --out")
-    if not os.access(out.parent, os.W_OK):  # known before the minutes of work, not after
-        raise InputError(f"{out.parent}: no folder that can be written to; name a file elsewhere with --out")
+        raise InputError(f"{out}: already exists; remove it or name another file with --out")
+    if not os.access(out.parent, os.W_OK):  # checked before minutes of work, not after
+        raise InputError(f"{out.parent}: not a writable folder; name a file elsewhere with --out")
     database = build_database(KittiFrames(options.data, read_split(options.data, options.split), crop=False))
     try:
         write_database(out, database)

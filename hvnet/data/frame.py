@@ -1,6 +1,6 @@
 """One frame of any sensor: its points, what is labelled in it, and the camera next to the LiDAR, if there is one.
 
-Everything is in LiDAR axes: x forward, y left, z up, metres. `Camera` is all that knows of pixels.
+Everything is in LiDAR axes: x forward, y left, z up, metres. Only `Camera` deals with pixels.
 """
 
 from collections import Counter
@@ -22,11 +22,11 @@ from hvnet.exceptions import InputError
 Floats = NDArray[np.float64]
 
 IMAGE_SIZE = (1242, 375)
-"""Width and height in pixels that a camera without an image is taken to have: most KITTI frames have them."""
+"""Width and height in pixels assumed for a camera without an image: those of most KITTI frames."""
 IMAGE_ERRORS = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
-"""What Pillow raises for files that are no images, or damaged ones."""
+"""What Pillow raises for files that are damaged or not images."""
 NEAR = 0.1
-"""Metres in front of the camera from where on boxes and lines are projected."""
+"""Distance of the near plane in metres: nothing closer to the camera is projected."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Camera:
         """2D boxes (M, 4) = left, top, right, bottom of boxes (M, 7), clipped to the image, and which are visible (M,).
 
         The 2D box encloses the projection of the part of the box in front of the camera: its corners there, and the
-        points where its edges pass the near plane. It is visible if some of the 2D box lies in the image; else it is
+        points where its edges pass the near plane. It is visible if some of the 2D box is in the image; otherwise it is
         zero.
         """
         corners = box_corners(torch.from_numpy(boxes.astype(np.float64))).numpy()
@@ -102,7 +102,7 @@ class Camera:
         begin, end = corners[:, EDGES[:, 0]], corners[:, EDGES[:, 1]]  # (M, 12, 3)
         crosses = (begin[..., 2] < NEAR) != (end[..., 2] < NEAR)
         share = np.where(crosses, NEAR - begin[..., 2], 0) / np.where(crosses, end[..., 2] - begin[..., 2], 1)
-        with np.errstate(all="ignore"):  # of boxes that are beyond all measure
+        with np.errstate(all="ignore"):  # boxes of absurd size overflow
             outline = np.concatenate((corners, begin + share[..., None] * (end - begin)), axis=1)  # (M, 20, 3)
         front = np.concatenate((corners[..., 2] >= NEAR, crosses), axis=1)
         pixels = outline[..., :2] / np.where(front, outline[..., 2], 1)[..., None]
@@ -154,11 +154,11 @@ class Camera:
 
 @dataclass(frozen=True)
 class Objects:
-    """What is labelled in a frame: M objects. Arrays are taken for tensors."""
+    """What is labelled in a frame: M objects. Arrays are converted to tensors."""
 
     boxes: Tensor  # (M, 7) float32 x, y, z of the centre, length, width, height, yaw
     names: Sequence[str]  # M classes, whatever the labels call them
-    labels: Labels | None = None  # the rows of a KITTI label file (K >= M) that they come from, regions as well
+    labels: Labels | None = None  # the rows of a KITTI label file (K >= M) that they come from, including regions
 
     def __post_init__(self) -> None:
         boxes = torch.as_tensor(self.boxes, dtype=torch.float32)
@@ -182,7 +182,7 @@ class Objects:
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame, whatever it was read from. Arrays are taken for tensors."""
+    """One frame, whatever it was read from. Arrays are converted to tensors."""
 
     name: str
     points: Tensor  # (N, 4) float32 x, y, z in metres, reflectance in [0, 1]; finite
@@ -210,7 +210,7 @@ class Frames(Protocol):
 
     @property
     def names(self) -> Sequence[str]:
-        """The names of the frames, none of them twice."""
+        """The names of the frames, without duplicates."""
 
     def __len__(self) -> int: ...
 

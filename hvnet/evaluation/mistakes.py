@@ -20,13 +20,13 @@ MISS, FALSE_POSITIVE = "miss", "false positive"
 
 
 class Mistake(NamedTuple):
-    """A labelled box that is not found, or a detection that is none."""
+    """A labelled box that is not found, or a detection without an object."""
 
     frame: str
     kind: str  # MISS or FALSE_POSITIVE
     name: str  # the class
     box: Tensor  # (7,) float32, LiDAR axes
-    score: float  # of the detection; for a miss that of the detection of its class with the best overlap, 0 for none
+    score: float  # of the detection; for a miss: of the best-overlapping detection of its class, or 0
     distance: float  # of the box's centre from the LiDAR on the ground, in metres
     points: int  # of the frame's cloud, inside the box
     overlap: float  # best BEV IoU with a detection (for a miss) or a label (for a false positive) of the class
@@ -42,7 +42,7 @@ def find_mistakes(frame: Frame, detections: Detections, rules: Mapping[str, Rule
     box with nothing in the image is no miss, as `frame_labels` leaves it out.
 
     A detection with score >= min_score is a false positive if it reaches that IoU with no label of its class, unless
-    KITTI does not score it: where a Van lies under a Car or a Person_sitting under a Pedestrian, where more than half
+    KITTI does not score it: where a Van is under a Car or a Person_sitting under a Pedestrian, where more than half
     of its 2D box is in a DontCare region, or where none of it is in the image.
     """
     labels, objects = frame_labels(frame), frame.objects

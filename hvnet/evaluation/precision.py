@@ -267,7 +267,7 @@ def _warnings(truths: Labels, detections: Labels, levels: Sequence[Level], count
             warnings.append(f"{of} no 2D box, as these levels ask: see hvnet.evaluate --no-2d-filter")
     for level, total in zip(levels, counts, strict=True):
         if 0 < total <= RECALL_STEPS:
-            # one threshold a ground truth at most, the first of which stands at recall 0
+            # at most one threshold per ground truth, and the first is at recall 0
             best = (100 * (total - 1) / RECALL_STEPS, 100 * math.ceil(total / 4) / 11)
             warnings.append(
                 f"{level.name}: {total} ground truths cap R40 at {best[0]:.2f} and R11 at {best[1]:.2f}: read 'exact'"

@@ -7,11 +7,11 @@ from hvnet.config import Config
 
 METRICS = ("2d", "bev", "3d")
 LARGE = 3.0
-"""Length in metres from which on a class without a rule of its own has to reach a car's overlap."""
+"""Length in metres from which a class without a rule of its own needs a car's overlap."""
 
 
 class Rule(NamedTuple):
-    """The overlaps of a class by metric, and the class that is so like it that to find one is neither right nor wrong.
+    """The overlaps of a class by metric, and the similar class whose detections count as neither right nor wrong.
 
     The neighbour counts for nothing where it is itself a class that is scored.
     """
@@ -54,5 +54,5 @@ def config_rules(config: Config, overlaps: Mapping[str, float] | None = None) ->
         rules[entry.name] = rule_for(entry.name, length, overlaps.get(entry.name, entry.overlap))
     unknown = [name for name in overlaps if name not in rules]
     if unknown:
-        raise ValueError(f"overlaps: {unknown[0]} is none of the classes {', '.join(rules)}")
+        raise ValueError(f"overlaps: {unknown[0]} is not one of the classes {', '.join(rules)}")
     return rules

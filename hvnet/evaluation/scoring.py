@@ -1,4 +1,4 @@
-"""A detector on frames of any format: what it finds, and how good that is."""
+"""Runs a detector on frames of any format and scores what it finds."""
 
 import textwrap
 from collections import Counter

@@ -1,4 +1,4 @@
-"""The result of an evaluation for people: a table, the curves as CSV, and a plot of them."""
+"""The result of an evaluation in readable form: a table, the curves as CSV, and a plot of them."""
 
 import csv
 from collections.abc import Iterable, Sequence
@@ -13,7 +13,7 @@ from hvnet.evaluation.rules import METRICS
 
 
 def format_table(result: dict[str, dict[str, Any]]) -> str:
-    """The result of `evaluate` for people, at most 100 columns wide with four levels or fewer."""
+    """The result of `evaluate` as text, at most 100 columns wide with four levels or fewer."""
     lines = []
     for name, scored in result.items():
         counts, levels = scored["counts"], scored["levels"]
@@ -102,7 +102,7 @@ def _curves(result: dict[str, dict[str, Any]]) -> Iterable[tuple[str, str, str, 
 
 def plot(path: Path, result: dict[str, dict[str, Any]]) -> None:
     """Draws the precision-recall curves: a row for every class, a column for every metric."""
-    from matplotlib.figure import Figure  # here, for it takes a second to import
+    from matplotlib.figure import Figure  # imported here because it takes a second
 
     classes = [name for name, scored in result.items() if scored["counts"]["detections"]] or list(result)
     figure = Figure(figsize=(4 * len(METRICS), 3.4 * len(classes)), layout="constrained")

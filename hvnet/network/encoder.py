@@ -70,7 +70,7 @@ class ScaleOfPoints(NamedTuple):
 class AttentiveVFE(nn.Module):
     """The layer inside AVFE and AVFEO (Fig. 3): M = BN(Linear(features)) * BN(Linear(g)), then the maximum a voxel.
 
-    One set of weights serves all scales. The batch norm of g takes its statistics over all scales at once: running
+    One set of weights serves all scales. The batch norm of g takes its statistics over all scales together: running
     statistics that mix scales would differ from those of any one scale in training.
     """
 
@@ -99,7 +99,7 @@ class AttentiveVFE(nn.Module):
 class VFE(nn.Module):
     """VoxelNet's layer (Zhou and Tuzel, CVPR 2018) in the place of AttentiveVFE: M = ReLU(BN(Linear([features, g]))).
 
-    The batch norm takes its statistics over all scales at once, as that of the attentive layer.
+    The batch norm takes its statistics over all scales together, as that of the attentive layer.
     """
 
     def __init__(self, in_channels: int, out_channels: int) -> None:

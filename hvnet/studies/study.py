@@ -148,7 +148,7 @@ def run_rows(
         try:
             outcomes.append(run_row(row, config, data.frames, real, folder, options.device))
         except Stopped as stop:
-            raise Stopped("stopped; the same command goes on from here", stop.signal) from stop
+            raise Stopped("stopped; the same command continues from here", stop.signal) from stop
         print(f"mAP {outcomes[-1].mean_ap():.1f}, trained in {shown(outcomes[-1].seconds, 0)} s", flush=True)
     return outcomes
 

@@ -28,7 +28,7 @@ class Data:
 
     train: Frames
     val: Frames
-    root: Path | None = None  # the KITTI root that they are from: it keeps the ground-truth database
+    root: Path | None = None  # their KITTI root, where the ground-truth database is kept
 
 
 def kitti_data(root: Path, config: Config) -> Data:
@@ -38,7 +38,7 @@ def kitti_data(root: Path, config: Config) -> Data:
 
 
 def generated_scenes(config: Config, folder: Path) -> Path:
-    """A KITTI root in the folder, of the scenes that the config asks for; what is there already is taken."""
+    """A KITTI root in the folder with the scenes that the config asks for; an existing one is reused."""
     assert config.synthetic is not None
     scenes, reach, seed = config.synthetic, config.encoder.point_range[3], config.train.seed
     root = folder / f"scenes-{scenes.train_frames}-{scenes.val_frames}-{reach:g}m-{seed}"
@@ -60,7 +60,7 @@ class Batch(NamedTuple):
     sample: Tensor  # (N,) int64
     boxes: list[Tensor]  # (M_b, 7) each
     labels: list[Tensor]  # (M_b,) int64 each, index into the config's classes
-    notes: list[str]  # what is to be said of the frames' files, once
+    notes: list[str]  # about the frames' files, each to be printed once
     names: list[str]  # of the frames
 
     def to(self, device: torch.device) -> "Batch":
@@ -72,7 +72,7 @@ class Batch(NamedTuple):
 class Sample(NamedTuple):
     """One frame."""
 
-    points: Tensor  # (N, 4), on a GPU where it is trained on one
+    points: Tensor  # (N, 4), on the GPU when training on one
     boxes: Tensor  # (M, 7)
     labels: Tensor  # (M,) int64, index into the config's classes, or -1
     note: str
@@ -97,7 +97,7 @@ class TrainingFrames(Dataset[Sample | InputError]):
             return error
 
     def augmented(self, epoch: int, k: int) -> Sample:
-        """Frame k as it is trained on in an epoch."""
+        """Frame k as training sees it in an epoch."""
         options = self.config.augment
         generator = seeded(self.config.train.seed, epoch, k)
         frame = self.read(k % len(self.frames))
@@ -173,7 +173,7 @@ def seeded(*numbers: int) -> torch.Generator:
 
 
 def collate(samples: Sequence[Sample | InputError]) -> Batch | InputError:
-    """Joins samples into a batch; if there is a mistake among them, it is the mistake."""
+    """Joins samples into a batch; returns the first error among them instead, if there is one."""
     good = []
     for each in samples:
         if isinstance(each, InputError):

@@ -17,7 +17,7 @@ class RunFolder(NamedTuple):
     """The files of a training run."""
 
     checkpoint: Path
-    metrics: list[dict[str, Any]]  # a record an epoch, none where there is no metrics.jsonl
+    metrics: list[dict[str, Any]]  # one record per epoch; empty if there is no metrics.jsonl
     root: Path | None  # the KITTI root that it was trained on, if the run says so
 
 
@@ -32,7 +32,7 @@ def find_run(path: Path) -> RunFolder:
     try:
         named = data.read_text(encoding="utf-8").strip() if data.is_file() else ""
     except UnicodeDecodeError as error:
-        raise InputError(f"{data}: is no text that names a KITTI root; remove it, and give --data") from error
+        raise InputError(f"{data}: does not hold the path of a KITTI root; remove it and give --data") from error
     root = Path(named) if named else None
     return RunFolder(checkpoint, _read_metrics(checkpoint.parent / "metrics.jsonl"), root)
 
@@ -47,17 +47,17 @@ def _read_metrics(path: Path) -> list[dict[str, Any]]:
             for table in record.get("validation", {}).values():
                 table["exact"]
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InputError(f"{path}:{number}: no record of hvnet.train; remove the line") from error
+            raise InputError(f"{path}:{number}: not a record of hvnet.train; remove the line") from error
         records.append(record)
     return records
 
 
 def check_folder(out: Path, resume: bool) -> None:
-    """Raises InputError unless a run can be begun in the folder `out` or, with `resume`, taken up there."""
+    """Raises InputError unless a run can start in the folder `out` or, with `resume`, continue there."""
     if resume and not (out / "checkpoint.pt").is_file():
         raise InputError(f"{out}: holds no checkpoint.pt to resume; give the run's folder with --out, or no --resume")
     if not resume:
-        check_empty(out, "give another --out, or --resume to go on with the run in it")
+        check_empty(out, "give another --out, or --resume to continue the run in it")
 
 
 def check_room(out: Path, model: HVNet) -> None:

@@ -35,7 +35,7 @@ from hvnet.pictures.clouds import Subject, draw_bev
 from hvnet.training.batches import Batch, Data, EpochOrder, TrainingFrames, check_frames, collate, training_objects
 
 SAVE_SECONDS = 300.0
-"""A run is saved after every epoch, and within one after so many seconds."""
+"""Seconds between saves within an epoch; a run is also saved after every epoch."""
 
 CHANGEABLE = [
     f"train.{key}"
@@ -59,7 +59,7 @@ class Run:
     def __init__(
         self, config: Config, data: Data, out: Path, device: torch.device | str = "cpu", *, resume: bool = False
     ) -> None:
-        """Checks the data, and takes up the run in the folder `out` or begins one there.
+        """Checks the data, and resumes the run in the folder `out` or starts one there.
 
         Raises InputError for a mistake in the data or the checkpoint.
         """
@@ -109,7 +109,7 @@ class Run:
         if batch_size % ranks.size():
             raise InputError(f"train.batch_size: want a multiple of the {ranks.size()} ranks, got {batch_size}")
         if ranks.size() > 1 and (config.loss.uncertainty or config.encoder.vfe == "pillar"):
-            raise InputError("loss.uncertainty and encoder.vfe=pillar: are for one process; start without torchrun")
+            raise InputError("loss.uncertainty and encoder.vfe=pillar: one process only; start without torchrun")
         # the order of a run that goes on must not depend on which frames can be read: the next one takes a place
         order = EpochOrder(config.train.repeat * len(data.train), batch_size, config.train.seed)
         if order.count < ranks.size():
@@ -127,7 +127,7 @@ class Run:
             TrainingFrames(data.train, config, objects, place),
             batch_sampler=order,
             collate_fn=collate,
-            generator=torch.Generator(),  # or every epoch that is begun would draw from torch's own
+            generator=torch.Generator(),  # otherwise every new epoch would draw from torch's global generator
             num_workers=config.train.workers,
             persistent_workers=config.train.workers > 0,
             # a forked worker would inherit Warp, CUDA and the threads of this process
@@ -229,7 +229,7 @@ class Run:
         return {name: total / count for name, total in sums.items() if name != "batches"}
 
     def validate(self) -> dict[str, dict[str, Any]]:
-        """Detects in the validation frames and scores the boxes as KITTI does; draws the first few."""
+        """Detects in the validation frames, scores the boxes by KITTI's protocol and draws the first few frames."""
         detector = Detector(self.model, self.device)
         classes, point_range = detector.classes, self.config.encoder.point_range
 
@@ -243,7 +243,7 @@ class Run:
             return score(detector, self.data.val, visit=draw, seen=self.seen, title="validating", background=False)
 
     def train(self) -> None:
-        """Runs the epochs that are left; writes checkpoint.pt, metrics.jsonl, tensorboard/ and pictures/.
+        """Runs the remaining epochs; writes checkpoint.pt, metrics.jsonl, tensorboard/ and pictures/.
 
         SIGTERM or SIGINT ends it after the step that is under way, saved, by raising Stopped.
         """
@@ -275,7 +275,7 @@ class Run:
         """Raises Stopped, on all ranks."""
         ranks.broadcast(None)  # torchrun ends the others as soon as one has ended: not while the first still writes
         message = (
-            f"stopped in epoch {self.progress.epoch + 1} after step {self.progress.step}; --resume goes on from there"
+            f"stopped in epoch {self.progress.epoch + 1} after step {self.progress.step}; --resume continues from there"
         )
         raise Stopped(message if ranks.rank() == 0 else "", self.signals[0] if self.signals else signal.SIGTERM)
 
@@ -305,7 +305,7 @@ class Run:
         print_once([f"{what}: left out; its frames are in {path}"] if ranks.rank() == 0 else [], set())
 
     def save(self) -> None:
-        """Writes a checkpoint: all that the run needs to go on."""
+        """Writes a checkpoint: all that is needed to resume the run."""
         if ranks.rank() == 0:
             content = {
                 "config": config_to_dict(self.config),
@@ -318,9 +318,9 @@ class Run:
             save_checkpoint(self.checkpoint, content)
 
     def restore(self) -> Progress:
-        """Takes up the run where its checkpoint left it. Raises InputError for a checkpoint of another run."""
+        """Resumes the run from its checkpoint. Raises InputError for a checkpoint of another run."""
         path, content = self.checkpoint, load_checkpoint(self.checkpoint)
-        there = config_to_dict(config_from_dict(content["config"], str(path)))  # with the keys that are newer than it
+        there = config_to_dict(config_from_dict(content["config"], str(path)))  # adds newer keys
         here = config_to_dict(self.config)
         changed = sorted({key for key, _ in set(_leaves(there)) ^ set(_leaves(here))})
         fixed = {"train.epochs"} if self.config.train.cosine else set()
@@ -335,7 +335,7 @@ class Run:
             torch.set_rng_state(content["random"])
             return Progress(*(content[key] for key in Progress._fields))
         except (KeyError, RuntimeError, ValueError, TypeError) as error:
-            raise InputError(f"{path}: does not hold a whole run ({error}); start anew with another --out") from error
+            raise InputError(f"{path}: does not hold a whole run ({error}); start again with another --out") from error
 
 
 def learning_rate(config: TrainConfig, step: int, epoch: int, steps: int) -> float:
@@ -355,7 +355,7 @@ def learning_rate(config: TrainConfig, step: int, epoch: int, steps: int) -> flo
 
 @contextlib.contextmanager
 def deterministic() -> Iterator[None]:
-    """Inside, torch gives the same bits on every run; afterwards its flags are what they were."""
+    """Inside, torch gives the same bits on every run; its flags are restored afterwards."""
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read once, when CUDA starts
     enabled, warn_only = (
         torch.are_deterministic_algorithms_enabled(),
@@ -386,7 +386,7 @@ def caught_signals(signals: list[int]) -> Iterator[None]:
 
     def note(number: int, _: Any) -> None:
         if signals:
-            raise Stopped("stopped at once; --resume goes on from the last checkpoint", number)
+            raise Stopped("stopped immediately; --resume continues from the last checkpoint", number)
         signals.append(number)
 
     before = {number: signal.signal(number, note) for number in (signal.SIGTERM, signal.SIGINT)}
@@ -398,7 +398,7 @@ def caught_signals(signals: list[int]) -> Iterator[None]:
 
 
 def ignore_signals(_: int) -> None:
-    """For worker processes: a signal to the whole group is this process's matter, and they end with it."""
+    """For worker processes: this process handles a signal to the whole group, and they end with it."""
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
 

@@ -1,6 +1,6 @@
-"""Makes the weights of the package anew: `python -m hvnet.weights --data KITTI_ROOT`.
+"""Retrains the weights of the package: `python -m hvnet.weights --data KITTI_ROOT`.
 
-It trains configs/compact.yaml by the recipe below and writes the result in half precision. The root is the piece of
+It trains configs/compact.yaml by the recipe below and writes the result in half precision. The root is the part of
 KITTI that docs/model_card.md names: 23 whole frames, and the objects of all 3712 training frames in gt_database.npz.
 """
 
@@ -39,7 +39,7 @@ RECIPE = (
 def halve(checkpoint: Path, out: Path) -> None:
     """Writes config and weights of a checkpoint, the parameters in half precision.
 
-    Running statistics stay in float32: variances of what comes out of the encoder are beyond float16.
+    Running statistics stay in float32: the variances of the encoder's output overflow float16.
     """
     content = load_checkpoint(checkpoint)
     running = ("running_mean", "running_var", "num_batches_tracked")
@@ -53,15 +53,15 @@ def main(arguments: Sequence[str] | None) -> None:
     """The command."""
     parser = make_parser(
         "weights",
-        "Makes the weights of the package anew: trains configs/compact.yaml by a recipe and writes the result in half "
-        "precision. The root is the piece of KITTI that docs/model_card.md names: 23 whole frames, and the objects of "
-        "all 3712 training frames in gt_database.npz.",
+        "Retrains the weights of the package: trains configs/compact.yaml by a fixed recipe and writes the "
+        "result in half precision. The root is the part of KITTI that docs/model_card.md names: 23 whole frames, and "
+        "the objects of all 3712 training frames in gt_database.npz.",
         ["--data /data/kitti", "--data /data/kitti --resume"],
     )
     parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="a KITTI root with gt_database.npz")
     parser.add_argument("--run", type=Path, default=Path("runs/weights"), metavar="DIR", help="(default: runs/weights)")
     parser.add_argument("--out", type=Path, default=Path("compact.pt"), metavar="FILE", help="(default: compact.pt)")
-    parser.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
+    parser.add_argument("--resume", action="store_true", help="continue a run that was stopped")
     add_device(parser)
     options = parser.parse_args(arguments)
     if not (options.data / FILE_NAME).is_file():

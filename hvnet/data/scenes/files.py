@@ -56,7 +56,7 @@ CAMERA = Camera(
 def truncation(boxes: Floats) -> Floats:
     """Share (M,) of what the sensor could see of boxes (M, 7) that lies outside the image.
 
-    The area of the 2D box is no measure for it: it is infinite for a box that reaches beside the camera.
+    The area of the 2D box is no measure for it: it is infinite for a box that reaches past the camera.
     """
     steps = (np.arange(12) + 0.5) / 12 - 0.5
     a, b = (grid.ravel() for grid in np.meshgrid(steps, steps))
@@ -120,7 +120,7 @@ def make_frame(seed: int, index: int, options: Options) -> tuple[Scene, Scan, La
 def generate(root: Path, frames_train: int, frames_val: int, seed: int, options: Options | None = None) -> None:
     """Writes scenes as a KITTI root: frames 0 to frames_train - 1 for training, the next frames_val for validation.
 
-    A folder that holds these very scenes is left as it is, one with a part of them is written anew, and any other that
+    A folder that holds these very scenes is left as it is, one with a part of them is rewritten, and any other that
     is not empty is refused.
     """
     root, options = Path(root), options or Options()
