@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None) -> None:
         run.checkpoint,
         run.metrics,
         detector,
-        read_split_frames(root, "val"),
+        read_split_frames(root, detector.config.train.val_split),
         of=str(root),
         count=options.count,
         min_score=options.min_score,
