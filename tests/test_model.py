@@ -6,20 +6,12 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
 
 from hvnet.config import Config, load_config
 from hvnet.kernels import reference
 from hvnet.network.anchors import make_anchors
 from hvnet.network.model import Detections, HVNet
 from tests.models import CONFIGS, some_points
-
-
-def any_boxes(count: int, seed: int = 0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    low = torch.tensor([0.0, -30.0, -2.0, 0.3, 0.3, 0.5, -math.pi])
-    high = torch.tensor([64.0, 30.0, 1.0, 8.0, 3.0, 3.0, math.pi])
-    return low + torch.rand(count, 7, generator=generator) * (high - low)
 
 
 def test_shapes_of_every_stage(demo: Config) -> None:
