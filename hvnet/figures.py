@@ -62,6 +62,9 @@ def main(arguments: Sequence[str] | None) -> None:
     if options.compare and not options.features:
         raise InputError("--compare: is for --features; give both")
     frames = find_frames(options.inputs, options.split)
+    if options.features and (clash := set(frames.names) & {f"{name}-features" for name in frames.names}):
+        name = min(clash)
+        raise InputError(f"{name}: has the name of the features of {name.removesuffix('-features')}; rename one")
     detector = load(options.checkpoint, options.device)
     models = [(detector, options.checkpoint.stem if options.checkpoint else "shipped weights")]
     if options.compare:
