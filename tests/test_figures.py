@@ -90,6 +90,7 @@ def test_features_are_those_of_the_encoder(checkpoints: list[Path], scenes: Path
         (["missing.bin"], "missing.bin: no such file or folder"),
         (["{cloud}", "--out", "{taken}"], "taken: is not empty; give another --out"),
         (["{cloud}", "--compare", "{checkpoint}"], "--compare: is for --features; give both"),
+        (["{cloud}", "{twin}", "--features"], "000001-features: has the name of the features of 000001; rename one"),
         (["{cloud}", "--checkpoint", "missing.pt"], "missing.pt: no such checkpoint"),
         (["{cloud}", "--features", "--compare", "missing.pt"], "missing.pt: no such checkpoint"),
     ],
@@ -98,7 +99,9 @@ def test_mistakes(checkpoints: list[Path], scenes: Path, tmp_path: Path, argumen
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "a").touch()
     cloud = scenes / "training" / "velodyne" / "000001.bin"
-    given = [each.format(cloud=cloud, taken=tmp_path / "taken", checkpoint=checkpoints[0]) for each in arguments]
+    places = {"cloud": cloud, "taken": tmp_path / "taken", "checkpoint": checkpoints[0]}
+    places["twin"] = shutil.copy(cloud, tmp_path / "000001-features.bin")
+    given = [each.format(**places) for each in arguments]
     with pytest.raises(InputError, match=re.escape(message)):
         main(["--out", str(tmp_path / "out"), *given, "--device", "cpu"])
 

@@ -1,5 +1,6 @@
 """The command of the studies: what it writes, that it goes on where it was stopped, and what it says of a mistake."""
 
+import contextlib
 import csv
 import json
 import os
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -17,6 +19,7 @@ from PIL import Image
 
 from hvnet.exceptions import InputError, Stopped
 from hvnet.network.checkpoint import load_checkpoint
+from hvnet.studies import study
 from hvnet.studies.catalogue import STUDIES
 from hvnet.studies.study import locked
 from hvnet.study import main
@@ -127,6 +130,25 @@ def test_mistakes(given: list[str], message: str, tmp_path: Path) -> None:
         main([*given, "--out", str(tmp_path / "out"), *scenes])
 
 
+@pytest.mark.parametrize("taken", [False, True])
+def test_the_lock_of_windows(taken: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where there is no fcntl."""
+    calls = []
+
+    def locking(file: int, mode: int, count: int) -> None:
+        calls.append((mode, count))
+        if taken:
+            raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(study, "sys", SimpleNamespace(platform="win32"))
+    monkeypatch.setitem(sys.modules, "fcntl", None)
+    monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(LK_NBLCK=2, locking=locking))  # type: ignore[arg-type]
+    expected = pytest.raises(InputError, match="another study") if taken else contextlib.nullcontext()
+    with expected, locked(tmp_path):
+        assert not taken
+    assert calls == [(2, 1)]
+
+
 def test_one_study_at_a_time(tmp_path: Path) -> None:
     with locked(tmp_path), pytest.raises(InputError, match="another study is at work there"):
         main(["speed", "--out", str(tmp_path)])
@@ -171,7 +193,7 @@ def test_a_signal_in_the_last_validation_stops_the_study(
 
     monkeypatch.setattr(Run, "train", train)
     given = arguments(tmp_path, "--data", str(scenes), "--budget", "steps=2", "--seeds", "1")
-    with pytest.raises(Stopped, match="stopped; the same command goes on from here") as raised:
+    with pytest.raises(Stopped, match="stopped; the same command continues from here") as raised:
         main(given)
     assert raised.value.signal == signal.SIGTERM
     assert len(trained) == 1

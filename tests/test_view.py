@@ -32,6 +32,7 @@ def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.Mon
         (["{cloud}", "--split", "val"], "--split val: none of the inputs is a KITTI root"),
         (["{cloud}", "--port", "70000"], "--port 70000: want 0 to 65535"),
         (["{cloud}", "--host", "203.0.113.7"], "--host 203.0.113.7: .*try 127.0.0.1"),
+        (["{cloud}", "--overlap", "Tram=0.5"], "--overlap Tram=0.5: no class Tram; there are Car"),
         (["{cut}"], "cut.bin: 15 bytes are no multiple of 16"),
     ],
 )

@@ -19,6 +19,7 @@ from hvnet.data.frame import Frame, Frames, Objects
 from hvnet.data.kitti import KittiFrames, boxes_to_labels, write_labels
 from hvnet.data.sources import find_frames
 from hvnet.evaluation.mistakes import FALSE_POSITIVE, MISS, Mistake
+from hvnet.evaluation.rules import config_rules
 from hvnet.exceptions import InputError
 from hvnet.kernels.voxel import make_grid
 from hvnet.network.detector import Detector, load
@@ -329,6 +330,20 @@ def test_the_worst_mistakes_are_listed_and_shown(viewer: Viewer) -> None:
         np.testing.assert_allclose(node.points.mean(axis=(0, 1))[:2], mistake.box[:2], atol=0.2)
     viewer.go(viewer.wanted + 1)
     assert viewer.server.scene.get_handle_by_name("/chosen") is None
+
+
+def test_mistakes_by_the_rules_that_are_given(detector: Detector, viewer: Viewer, scenes: Path) -> None:
+    """With a lower overlap no more is missed, and less is wrong."""
+    server = start_server("127.0.0.1", 0)
+    try:
+        rules = config_rules(detector.config, dict.fromkeys(detector.classes, 0.05))
+        lenient = Viewer(server, detector, find_frames([scenes]), rules)
+        for each in (viewer, lenient):
+            each.search()
+        counts = [sum(map(len, each.mistakes.values())) for each in (viewer, lenient)]
+        assert counts[1] < counts[0]
+    finally:
+        server.stop()
 
 
 def test_a_frame_that_cannot_be_read_is_named_and_left_again(
