@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hvnet.data.frame import Camera
+from hvnet.data.frame import Camera, Frame
 from hvnet.data.labels import Labels
 from hvnet.evaluation.rules import KITTI
 
@@ -23,6 +23,23 @@ CAMERA = Camera(
     velo_to_cam=np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]]),
 )
 """At the LiDAR's origin, looking along +x: u = 600 - 700 y / x, v = 180 - 700 z / x."""
+
+
+class GivenFrames:
+    """Frames that a test made, as a data format of its own; an error in the place of one is raised."""
+
+    def __init__(self, *frames: Frame | Exception) -> None:
+        self.frames = frames
+        self.names = [each.name if isinstance(each, Frame) else f"frame {k}" for k, each in enumerate(frames)]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, k: int) -> Frame:
+        each = self.frames[k]
+        if isinstance(each, Exception):
+            raise each
+        return each
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -1,4 +1,4 @@
-"""Backbone, heads, anchors, losses and the whole detector."""
+"""The whole network: shapes of every stage, the paper's numbers, mirrored scenes, batches."""
 
 import copy
 import dataclasses

@@ -8,14 +8,14 @@ import pytest
 import torch
 from PIL import Image
 
-from hvnet.data.frame import Camera, Frame, Frames, Objects
+from hvnet.data.frame import Frame, Frames, Objects
 from hvnet.data.kitti import KittiFrames, read_frame, read_split, read_split_frames
 from hvnet.evaluation.mistakes import FALSE_POSITIVE, MISS, Mistake, find_mistakes, worst
 from hvnet.evaluation.rules import config_rules
 from hvnet.network.detector import load
 from hvnet.pictures.page import describe, make_page
 from hvnet.training.folder import find_run
-from tests.helpers import CAMERA
+from tests.helpers import CAMERA, GivenFrames
 from tests.models import TINY, save_untrained
 from tests.pages import Page, write_run
 
@@ -70,30 +70,19 @@ def test_a_page_of_pillars(pillars: Path, scenes: Path) -> None:
     assert "0 false positives" in page.text
 
 
-class Own:
-    """A data format of a user: two frames, the first with a camera."""
-
-    names = ("first", "second")
-
-    def __len__(self) -> int:
-        return 2
-
-    def __getitem__(self, k: int) -> Frame:
-        cameras: tuple[Camera | None, ...] = (CAMERA, None)
-        objects = Objects(torch.tensor([[10.0, 0, -1, 4, 2, 1.5, 0]]), ["excavator"])
-        points = torch.rand(500, 4, generator=torch.Generator().manual_seed(k)) * 10
-        return Frame(self.names[k], points, objects, cameras[k])
-
-
 def test_frames_of_another_format(tmp_path: Path) -> None:
     """Of a class that KITTI does not know; with a camera the crop is in the image as well."""
     own = ["augment.objects={}", "head.classes.Cyclist.name=excavator"]
     few = ["head.score_threshold=0.0", "head.candidates=50", "head.detections=1"]
     save_untrained(tmp_path / "model.pt", [*TINY, *few, *own])
-    page = Page(page_of(tmp_path / "model.pt", Own(), 2, 1.0))
+    points = torch.rand(500, 4, generator=torch.Generator().manual_seed(0)) * 10
+    objects = Objects(torch.tensor([[10.0, 0, -1, 4, 2, 1.5, 0]]), ["excavator"])
+    frames = GivenFrames(Frame("first", points, objects, CAMERA), Frame("second", points, objects))
+    page = Page(page_of(tmp_path / "model.pt", frames, 2, 1.0))
     assert "2 misses and 0 false positives" in page.text
     assert "excavator BEV0.5" in page.text
-    assert {name for name in Own.names if f"excavator, frame {name}" in page.text} == set(Own.names)
+    for name in frames.names:
+        assert f"excavator, frame {name}" in page.text
     widths = []
     for crop in page.images("crop"):
         picture = base64.b64decode((crop["src"] or "").removeprefix("data:image/png;base64,"), validate=True)

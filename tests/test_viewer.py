@@ -38,7 +38,7 @@ from hvnet.pictures.viewer import (
     start_server,
 )
 from tests.browser import shown
-from tests.helpers import CAMERA
+from tests.helpers import CAMERA, GivenFrames
 
 SCORES = [0.9, 0.5, 0.1]
 
@@ -205,30 +205,13 @@ def test_a_real_frame_with_its_image(serve: Callable[[Path | Frames], Viewer], k
     assert names[: len(objects.names)] == list(objects.names)
 
 
-class Own:
-    """A data format of a user: no files, no camera but where one is given."""
-
-    def __init__(self, *frames: Frame | Exception) -> None:
-        self.frames = frames
-        self.names = [each.name if isinstance(each, Frame) else f"frame {k}" for k, each in enumerate(frames)]
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, k: int) -> Frame:
-        each = self.frames[k]
-        if isinstance(each, Exception):
-            raise each
-        return each
-
-
 def test_frames_of_another_format(serve: Callable[[Path | Frames], Viewer], viewer: Viewer, tmp_path: Path) -> None:
     """What its arrays or its image have wrong is said where the frame is chosen, and other frames can be chosen."""
     points, objects = viewer.frame.points, Objects(torch.tensor([[10.0, 0, -1, 4, 2, 1.5, 0]]), ["Car"])
     damaged = replace(CAMERA, image=tmp_path / "image.png")
     (tmp_path / "image.png").write_text("no image")
     other = serve(
-        Own(
+        GivenFrames(
             Frame("a", points, objects),
             Frame("b", points, objects, damaged),
             ValueError("points: want shape (N, 4)"),
@@ -247,7 +230,7 @@ def test_frames_of_another_format(serve: Callable[[Path | Frames], Viewer], view
     assert shown(other.info.content)[1] > 0
     assert "0 labelled" in other.info.content
     with pytest.raises(InputError, match="2 frames are named a"):
-        serve(Own(Frame("a", points), Frame("a", points)))
+        serve(GivenFrames(Frame("a", points), Frame("a", points)))
 
 
 # --- controls ---------------------------------------------------------------------------------------------------------
