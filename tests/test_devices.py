@@ -9,7 +9,7 @@ import warp as wp
 
 import hvnet
 from hvnet.exceptions import InputError
-from hvnet.kernels.launch import cuda_problem
+from hvnet.kernels.launch import cuda_problem, launch
 from hvnet.kernels.rotated import rotated_iou_bev
 from hvnet.network.devices import device_name, select_device
 
@@ -42,6 +42,9 @@ def test_a_gpu_that_warp_does_not_see(monkeypatch: pytest.MonkeyPatch) -> None:
         assert select_device("auto") == torch.device("cpu")
     with pytest.raises(InputError, match=r"^device cuda: torch sees a GPU, but Warp \S+ does not: "):
         select_device("cuda")
+    with pytest.raises(RuntimeError) as caught:  # a kernel that is called by itself, on a tensor that torch put there
+        launch(None, 1, [], torch.device("cuda"))
+    assert str(caught.value) == problem
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert select_device("cpu") == torch.device("cpu")

@@ -27,6 +27,8 @@ def test_the_face() -> None:
     assert set(hvnet.__all__) == {"Detector", "InputError", "__version__", "load"}
     assert all(hasattr(hvnet, name) for name in hvnet.__all__)
     assert hvnet.__version__ == version("hvnet")
+    assert f"\nversion: {hvnet.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\n## {hvnet.__version__}" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     with pytest.raises(AttributeError, match="module 'hvnet' has no attribute 'laod'"):
         hvnet.laod  # noqa: B018
     code = "import sys, hvnet.kernels.scatter; assert 'hvnet.network' not in sys.modules"
