@@ -1,7 +1,7 @@
 """The device to run on, and what it is called."""
 
 import platform
-import warnings
+import sys
 from pathlib import Path
 
 import torch
@@ -18,7 +18,7 @@ def select_device(name: str) -> torch.device:
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
         if name == "cuda" and (problem := cuda_problem()):
-            warnings.warn(f"{problem}; going on with the CPU", RuntimeWarning, stacklevel=2)
+            print(f"{problem}; going on with the CPU", file=sys.stderr)
             name = "cpu"
     elif name.startswith("cuda"):
         if not torch.cuda.is_available():
