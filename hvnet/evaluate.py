@@ -10,7 +10,7 @@ from pathlib import Path
 
 from hvnet.cli import add_overlaps, make_parser, read_overlaps, run_command
 from hvnet.data.kitti import TYPES
-from hvnet.data.labels import DONTCARE, Labels
+from hvnet.data.labels import DONTCARE, Labels, count_others
 from hvnet.evaluation.folders import read_folders, read_point_counts
 from hvnet.evaluation.matching import LEVELS_WITHOUT_2D, Level, distance_levels
 from hvnet.evaluation.precision import evaluate
@@ -46,12 +46,6 @@ def choose_classes(given: Sequence[str] | None, labels: Sequence[Labels], predic
         there = f"there are {', '.join(sorted(known))}" if known else "there are none"
         raise InputError(f"--classes {missing[0]}: no label or result is of this class; {there}")
     return list(given)
-
-
-def unscored(frames: Sequence[Labels], classes: Sequence[str]) -> str:
-    """How many rows are of a class that is not scored, such as "91 Van, 14 Truck"; empty if none."""
-    counts = Counter(name for frame in frames for name in frame.name.tolist() if name not in (*classes, DONTCARE))
-    return ", ".join(f"{count} {name}" for name, count in counts.most_common())
 
 
 def main(argv: Sequence[str] | None) -> None:
@@ -131,7 +125,7 @@ def main(argv: Sequence[str] | None) -> None:
     empty = f", {without} of them without a result file, counted as empty" if without else ""
     print(f"\n{len(frames)} frame{'s' * (len(frames) != 1)} scored{empty}")
     for what, rows in (("labels", labels), ("results", predictions)):
-        if others := unscored(rows, classes):
+        if others := count_others((name for frame in rows for name in frame.name.tolist()), classes):
             print(textwrap.fill(f"{what} of classes that are not scored: {others}", 100))
     figures = {name: {key: scored[key] for key in scored if key != "curves"} for name, scored in result.items()}
     try:

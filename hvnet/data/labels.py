@@ -1,6 +1,7 @@
 """The rows of KITTI's label and result files, which its evaluation compares."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -69,3 +70,10 @@ def no_results() -> Labels:
     whole = np.empty(0, np.int64)
     three = np.empty((0, 3))
     return Labels(np.empty(0, np.str_), none, whole, none, np.empty((0, 4)), three, three, none, score=none)
+
+
+def count_others(names: Iterable[str], classes: Iterable[str]) -> str:
+    """How many names are neither of these classes nor DontCare, such as "91 Van, 14 Truck"; empty if none."""
+    known = {*classes, DONTCARE}
+    counts = Counter(name for name in names if name not in known)
+    return ", ".join(f"{count} {name}" for name, count in counts.most_common())

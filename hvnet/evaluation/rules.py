@@ -30,8 +30,11 @@ KITTI = {
 
 
 def rule_for(name: str, length: float, overlap: float | None = None) -> Rule:
-    """The rule of a class: KITTI's own for its three; else the given overlap, or 0.7 for objects of LARGE and more
-    metres of length and 0.5 for smaller ones. The loose overlap is 0.5, or half of a strict one of 0.5 and less."""
+    """The rule of a class: with the given overlap; else KITTI's own for its three, and for others 0.7 for objects of
+    LARGE and more metres of length, 0.5 for smaller ones. The loose overlap is 0.5, or half of a strict one up to 0.5.
+
+    length: metres.
+    """
     known = KITTI.get(name)
     if known is not None and overlap is None:
         return known

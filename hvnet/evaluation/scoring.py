@@ -1,7 +1,6 @@
 """Runs a detector on frames of any format and scores what it finds."""
 
 import textwrap
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -12,7 +11,7 @@ from hvnet import ranks
 from hvnet.config import Config
 from hvnet.data.frame import Frame, Frames, check_names, frame_at
 from hvnet.data.kitti import centres_to_lidar, detections_to_labels, frame_labels
-from hvnet.data.labels import DONTCARE, Labels
+from hvnet.data.labels import DONTCARE, Labels, count_others
 from hvnet.evaluation.precision import evaluate
 from hvnet.evaluation.rules import Rule, config_rules
 from hvnet.network.detector import Detector
@@ -89,12 +88,10 @@ def labels_in_range(frame: Frame, config: Config) -> Labels:
 
 def background_note(names: Iterable[str], classes: Iterable[str]) -> str:
     """How many of the labels have a class that is not among these, in lines of 100 characters; empty if none."""
-    counts = Counter(names)
-    others = {name: count for name, count in counts.most_common() if name not in set(classes) | {DONTCARE}}
+    others = count_others(names, classes)
     if not others:
         return ""
-    listed = ", ".join(f"{count} {name}" for name, count in others.items())
-    return textwrap.fill(f"labels of classes that the config does not have count as background: {listed}", 100)
+    return textwrap.fill(f"labels of classes that the config does not have count as background: {others}", 100)
 
 
 def print_once(notes: Iterable[str], seen: set[str]) -> None:
