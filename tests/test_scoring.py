@@ -1,5 +1,6 @@
 """A detector on frames: its scores are those of the evaluation of its boxes, and what is said of the frames."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -145,5 +146,6 @@ def test_background_note() -> None:
     names = ["Car", "cone", "Van", "DontCare", "cone", "Car"]
     said = "labels of classes that the config does not have count as background: "
     assert background_note(names, ["Car", "Cyclist"]) == f"{said}2 cone, 1 Van"
+    assert background_note(Counter(names), ["Car", "Cyclist"]) == f"{said}2 cone, 1 Van"
     assert background_note(names, ["Car", "cone", "Van"]) == ""
     assert background_note([], ["Car"]) == ""

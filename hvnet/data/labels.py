@@ -73,7 +73,9 @@ def no_results() -> Labels:
 
 
 def count_others(names: Iterable[str], classes: Iterable[str]) -> str:
-    """How many names are neither of these classes nor DontCare, such as "91 Van, 14 Truck"; empty if none."""
+    """How many names are neither of these classes nor DontCare, such as "91 Van, 14 Truck"; empty if none.
+
+    names: one per object, or a Counter of them.
+    """
     known = {*classes, DONTCARE}
-    counts = Counter(name for name in names if name not in known)
-    return ", ".join(f"{count} {name}" for name, count in counts.most_common())
+    return ", ".join(f"{count} {name}" for name, count in Counter(names).most_common() if name not in known)
