@@ -5,9 +5,16 @@ import math
 import sys
 import textwrap
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
 
+from hvnet.config import Config, DataConfig
+from hvnet.data.columns import parse_columns
+from hvnet.data.labels import class_map
 from hvnet.exceptions import InputError, Stopped
+
+MAX_SENSOR_HEIGHT = 100.0  # metres
 
 
 def make_parser(command: str, description: str, examples: Sequence[str]) -> argparse.ArgumentParser:
@@ -28,6 +35,104 @@ def add_inputs(parser: argparse.ArgumentParser, suffixes: Sequence[str]) -> None
     parser.add_argument(
         "--split", metavar="NAME", help="frames of ImageSets/NAME.txt of a KITTI root (default: all frames)"
     )
+
+
+def add_reading(parser: argparse.ArgumentParser) -> None:
+    """The options --columns, --reflectance-scale and --classes; see `read_reading`."""
+    parser.add_argument(
+        "--columns",
+        metavar="N|NAMES",
+        help="the numbers of a point in .bin and .npy files: 5, or x,y,z,i,_ (i: the reflectance; default: found out)",
+    )
+    parser.add_argument(
+        "--reflectance-scale",
+        metavar="X|none",
+        help="what the reflectance is divided by, such as 255; none leaves it out (default: found out)",
+    )
+    parser.add_argument(
+        "--classes",
+        action="append",
+        default=[],
+        metavar="NAME=CLASS",
+        help="labels of this name count as a class of the detector, such as bicycle=Cyclist",
+    )
+
+
+def read_reading(
+    options: argparse.Namespace, given: DataConfig | None = None, classes: Sequence[str] | None = None
+) -> DataConfig:
+    """How clouds and labels are read: the options of `add_reading`, and what is `given` where they say nothing.
+
+    Raises InputError for a value that means nothing, and for a class that is not one of these, if they are known.
+    """
+    changes: dict[str, Any] = {}
+    if options.columns is not None:
+        changes["columns"] = parse_columns(options.columns)
+    if options.reflectance_scale is not None:
+        scale = 0.0 if options.reflectance_scale == "none" else _number(options.reflectance_scale)
+        if not 0 <= scale < math.inf or (scale == 0 and options.reflectance_scale != "none"):
+            raise InputError(f"--reflectance-scale {options.reflectance_scale}: want a number above 0, or none")
+        changes["reflectance_scale"] = scale
+    if options.classes:
+        changes["classes"] = class_map(options.classes)
+        for name, meant in changes["classes"].items():
+            if classes is not None and meant not in classes:
+                raise InputError(f"--classes {name}={meant}: no class {meant}; there are {', '.join(classes)}")
+    return replace(given or DataConfig(), **changes)
+
+
+def of_labels(config: Config) -> DataConfig:
+    """How the labels of a config's data are read; other clouds than those may be of another sensor."""
+    return DataConfig(classes=config.data.classes)
+
+
+def add_sensor_height(parser: argparse.ArgumentParser) -> None:
+    """The option --sensor-height; see `read_sensor_height`."""
+    parser.add_argument(
+        "--sensor-height",
+        metavar="METRES",
+        help="of the LiDAR above the road; none: clouds stay where they are (default: found from the ground)",
+    )
+
+
+def read_sensor_height(options: argparse.Namespace) -> float | Literal["none"] | None:
+    """The value of --sensor-height, None where it is not given. Raises InputError for one that means nothing."""
+    text = options.sensor_height
+    if text is None or text == "none":
+        return text
+    height = _number(text)
+    if not 0 <= height <= MAX_SENSOR_HEIGHT:
+        raise InputError(f"--sensor-height {text}: want metres from 0 to {MAX_SENSOR_HEIGHT:g}, or none")
+    return height
+
+
+def add_mount(parser: argparse.ArgumentParser) -> None:
+    """The options --sensor-height, --turn and --all-round; see `read_mount`."""
+    add_sensor_height(parser)
+    parser.add_argument(
+        "--turn",
+        default="0",
+        metavar="DEGREES",
+        help="turn the cloud counter-clockwise, so that its forward points along x: -90 where it is y (default: 0)",
+    )
+    parser.add_argument(
+        "--all-round", action="store_true", help="detect in all directions: several looks, joined by NMS"
+    )
+
+
+def read_mount(options: argparse.Namespace) -> dict[str, Any]:
+    """The options of `add_mount` as `hvnet.load` takes them. Raises InputError for a value that means nothing."""
+    height, turn = read_sensor_height(options), _number(options.turn)
+    if not abs(turn) <= 360:
+        raise InputError(f"--turn {options.turn}: want degrees from -360 to 360")
+    return {"sensor_height": "found" if height is None else height, "turn": turn, "all_round": options.all_round}
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:

@@ -21,6 +21,7 @@ MAX_CELLS = 2**26
 MAX_CHANNELS = 4096
 MAX_LAYERS = 200
 """Layers of a block. Larger configs are rejected as mistakes before they use up all memory."""
+COLUMNS = "x, y and z once each, i (the reflectance) at most once, and _ for any other number"
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,16 @@ class SyntheticConfig:
 
 
 @dataclass(frozen=True)
+class DataConfig:
+    """How clouds and labels are read (docs/sensors.md). What is not given is found out from the clouds."""
+
+    columns: tuple[str, ...] = ()  # the numbers of a point in .bin and .npy files: x, y, z, i, and _ for any other
+    reflectance_scale: float | None = None  # what the reflectance is divided by; 0: it is left out
+    sensor_height: float | None = None  # metres of the LiDAR above the road
+    classes: dict[str, str] = field(default_factory=dict)  # names in the labels, and the classes that they count as
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Optimisation, validation and what is written."""
 
@@ -150,6 +161,7 @@ class Config:
     backbone: BackboneConfig = field(default_factory=BackboneConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
+    data: DataConfig = field(default_factory=DataConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
     synthetic: SyntheticConfig | None = None
 
@@ -319,6 +331,12 @@ def _build(kind: Any, value: Any, key: str, source: str) -> Any:
     return value
 
 
+def are_columns(names: Sequence[str]) -> bool:
+    """Whether the names say what the numbers of a point are, as `COLUMNS` has it."""
+    counts = {name: list(names).count(name) for name in ("x", "y", "z", "i")}
+    return set(names) <= {*counts, "_"} and all(counts[axis] == 1 for axis in "xyz") and counts["i"] <= 1
+
+
 class Check(NamedTuple):
     """A condition that single values have to meet."""
 
@@ -357,6 +375,8 @@ CHECKS = (
     Check("augment", "rotation", "0 or more", lambda v: v >= 0),
     Check("augment", "scaling", "0 < low <= high", lambda v: 0 < v[0] <= v[1]),
     Check("augment", "translation", "0 or more", lambda v: min(v) >= 0),
+    Check("data", "columns", COLUMNS, lambda v: not v or are_columns(v)),
+    Check("data", "reflectance_scale", "above 0, or 0 for none", lambda v: v is None or v >= 0),
     Check("train", "epochs repeat batch_size validate_every", "1 or more", lambda v: v > 0),
     Check("train", "warmup_steps pictures workers weight_decay seed", "0 or more", lambda v: v >= 0),
     Check("train", "learning_rate warmup_ratio decay_ratio gradient_clip", "above 0", lambda v: v > 0),
@@ -392,6 +412,8 @@ def _check(config: Config, source: str) -> None:
         want(0 <= entry.level < levels, f"{key}.level", "0, 1 or 2" if levels == 3 else "0, the only one", entry.level)
         want(0 <= entry.negative_iou <= entry.positive_iou, f"{key}.negative_iou",
              "between 0 and positive_iou", entry.negative_iou)  # fmt: skip
+    for name, meant in config.data.classes.items():
+        want(meant in names, f"data.classes.{name}", f"a class of head.classes ({', '.join(names)})", meant)
     for name, count in config.augment.objects.items():
         wanted = f"a class of head.classes ({', '.join(names)}; rename or remove it)"
         want(name in names, f"augment.objects.{name}", wanted, name)

@@ -101,7 +101,7 @@ def test_empty_label_file_means_no_objects(tmp_path: Path, scored: bool) -> None
 
 BAD_LABELS = [
     (CAR.rsplit(" ", 1)[0], False, "14 fields, expected 15"),
-    (f"{CAR} 0.5", False, "16 fields, expected 15"),
+    (f"{CAR} 0.5 7", False, "17 fields, expected 15"),
     (CAR, True, "15 fields, expected 16"),
     (CAR.replace("10.00", "ten"), False, "field 14 is 'ten', not a finite number"),
     (CAR.replace("10.00", "nan"), False, "field 14 is 'nan', not a finite number"),
@@ -109,6 +109,49 @@ BAD_LABELS = [
     (CAR.replace("0.25 1 ", "0.25 1.5 "), False, "field 3 is '1.5', not a whole number"),
     (CAR.replace("1.60 4.00", "0.00 4.00"), False, "height, width or length (fields 9 to 11) is not positive"),
 ]
+
+
+def test_a_sixteenth_field_of_labels_is_ignored(tmp_path: Path) -> None:
+    """Other tools write a score or an id there."""
+    path = tmp_path / "000000.txt"
+    path.write_text(f"{CAR} track_7\n{DONT_CARE}\n{CAR} nan\n")
+    labels = read_labels(path)
+    assert labels.name.tolist() == ["Car", "DontCare", "Car"]
+    assert labels.score is None
+    assert labels.rotation_y.tolist() == [-1.3, -10, -1.3]
+
+
+def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path: Path) -> None:
+    path = tmp_path / "000000.txt"
+    path.write_text(f"{CAR} 0.5\n", encoding="utf-8-sig")
+    assert read_labels(path).name.tolist() == read_labels(path, scored=True).name.tolist() == ["Car"]
+    write_calibration(path, CAMERA)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(lines[2:]), encoding="utf-8-sig")  # P2 first
+    assert np.array_equal(read_calibration(path).p2, CAMERA.p2)
+
+
+NO_3D = "Car 0 0 0.5 100 120 300 240 -1 -1 -1 -1000 -1000 -1000 -10"
+
+
+def test_labels_without_a_3d_box(root: Path) -> None:
+    """For 2D alone they are read; whoever needs 3D boxes refuses them."""
+    path = root / "training" / "label_2" / "000000.txt"
+    path.write_text(f"{CAR}\n{NO_3D}\n{NO_3D.replace('-1 -1 -1 -1000', '0 0 0 -1000')}\n{DONT_CARE}\n")
+    labels = read_labels(path, needs_3d=False)
+    assert labels.has_3d().tolist() == [True, False, False, False]
+    assert labels.has_2d().tolist() == [True] * 4
+    message = re.escape(f"{path}:2: height, width or length (fields 9 to 11) is not positive; give the object's size")
+    for read in (read_labels, lambda _: read_frame(root, "000000"), lambda _: KittiFrames(root, ["000000"])[0]):
+        with pytest.raises(InputError, match=message):
+            read(path)
+    with pytest.raises(InputError, match=message):
+        KittiFrames(root, ["000000"]).object_names(0)
+    path.write_text(f"{NO_3D}\n{CAR.replace('1.60 4.00', '-1 -1')}\n")  # some of them are a mistake all the same
+    with pytest.raises(InputError, match=re.escape(f"{path}:2: height, width or length")):
+        read_labels(path, needs_3d=False)
+    path.write_text(f"{NO_3D} 0.5\n")
+    assert not read_labels(path, scored=True).has_3d().any()
 
 
 @pytest.mark.parametrize(("line", "scored", "message"), BAD_LABELS)
@@ -547,6 +590,100 @@ def test_any_word_is_a_class(root: Path, scored: bool) -> None:
 @pytest.mark.parametrize("name", ["traffic cone", "", " "])
 def test_a_class_that_is_no_word_is_not_written(tmp_path: Path, name: str) -> None:
     """Its file could not be read."""
+    labels = boxes_to_labels(BOXES, ["Car", "Cyclist"])
     with pytest.raises(ValueError, match=f"labels: want classes of one word each, got '{name}'"):
-        write_labels(tmp_path / "a.txt", boxes_to_labels(BOXES, ["Car", name]))
+        write_labels(tmp_path / "a.txt", replace(labels, name=np.array(["Car", name])))
     assert not (tmp_path / "a.txt").exists()
+    with pytest.raises(ValueError, match=f"names: want classes of one word each, got '{name}'"):
+        boxes_to_labels(BOXES, ["Car", name])
+
+
+BAD_COLUMNS = [
+    ("occlusion", np.array([0, 1.5]), "labels.occlusion: want whole numbers, got 1.5"),
+    ("occlusion", np.array([0, np.nan]), "labels.occlusion: want finite numbers, got nan"),
+    ("truncation", np.array([np.inf, 0]), "labels.truncation: want finite numbers, got inf"),
+    ("alpha", np.array([0, -np.inf]), "labels.alpha: want finite numbers, got -inf"),
+    ("bbox", np.full((2, 4), np.nan), "labels.bbox: want finite numbers, got nan"),
+    ("location", np.full((2, 3), np.nan), "labels.location: want finite numbers, got nan"),
+    ("rotation_y", np.array([0, 1j]), "labels.rotation_y: want real numbers, got dtype complex128"),
+    ("score", np.array([0.5, np.nan]), "labels.score: want finite numbers, got nan"),
+    (
+        "dimensions",
+        np.array([[1.5, 1.6, 4], [1.5, 0.004, 4]]),
+        "labels.dimensions: want sizes of 0.01 and more in row 1",
+    ),
+]
+
+
+@pytest.mark.parametrize(("column", "values", "message"), BAD_COLUMNS)
+def test_labels_that_could_not_be_read_are_not_written(
+    tmp_path: Path, column: str, values: np.ndarray, message: str
+) -> None:
+    labels = replace(boxes_to_labels(BOXES, ["Car", "Cyclist"]), **{column: values})
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}"):
+        write_labels(tmp_path / "a.txt", labels)
+    assert not (tmp_path / "a.txt").exists()
+
+
+def test_what_may_be_written(tmp_path: Path) -> None:
+    """A size that rounds up to 0.01, an occlusion of another dtype, a region; and results without 3D boxes."""
+    labels = boxes_to_labels(BOXES, ["Car", "DontCare"])
+    sizes = np.array([[1.5, 0.0051, 4], [-1, -1, -1]])
+    labels = replace(labels, dimensions=sizes, occlusion=np.array([2.0, -1.0]))
+    write_labels(tmp_path / "a.txt", labels)
+    again = read_labels(tmp_path / "a.txt")
+    assert again.dimensions.tolist() == [[1.5, 0.01, 4], [-1, -1, -1]]
+    assert again.occlusion.tolist() == [2, -1]
+    results = replace(labels, name=np.array(["Car", "Van"]), score=np.array([0.5, 0.25]))
+    write_labels(tmp_path / "b.txt", results)
+    assert read_labels(tmp_path / "b.txt", scored=True).has_3d().tolist() == [True, False]
+
+
+NO_BOX = np.zeros((2, 6))
+
+
+@pytest.mark.parametrize(
+    ("boxes", "names", "scores", "message"),
+    [
+        (NO_BOX, ["Car"] * 2, None, "boxes: want shape (M, 7) with x, y, z, l, w, h, yaw, got (2, 6)"),
+        (BOXES[0], ["Car"] * 2, None, "boxes: want shape (M, 7) with x, y, z, l, w, h, yaw, got (7,)"),
+        (BOXES * np.nan, ["Car"] * 2, None, "boxes: want finite numbers, got nan"),
+        (BOXES.astype(str), ["Car"] * 2, None, "boxes: want real numbers, got dtype"),
+        (BOXES, ["Car"], None, "names: want one for each of the 2 boxes, got 1"),
+        (BOXES, ["Car"] * 2, np.ones(3), "scores: want one for each of the 2 boxes, got shape (3,)"),
+        (BOXES, ["Car"] * 2, np.ones((2, 1)), "scores: want one for each of the 2 boxes, got shape (2, 1)"),
+        (BOXES, ["Car"] * 2, np.array([1, np.inf]), "scores: want finite numbers, got inf"),
+        (BOXES * [1, 1, 1, 1, 0, 1, 1], ["Car"] * 2, None, "boxes: want l, w, h above 0, got [4.  0.  1.5] in row 0"),
+    ],
+)
+def test_boxes_that_are_no_labels(boxes: np.ndarray, names: list[str], scores: np.ndarray | None, message: str) -> None:
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}"):
+        boxes_to_labels(boxes, names, None, scores)
+
+
+def test_detections_without_a_size_are_results() -> None:
+    assert len(boxes_to_labels(BOXES * [1, 1, 1, 0, 0, 0, 1], ["Car"] * 2, None, np.ones(2))) == 2
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (np.zeros((5, 3)), "points: want shape (N, 4) with x, y, z, reflectance, got (5, 3)"),
+        (np.zeros(4), "points: want shape (N, 4) with x, y, z, reflectance, got (4,)"),
+        (np.zeros((5, 4), np.complex64), "points: want real numbers, got dtype complex64"),
+        (np.zeros((5, 4)).astype(str), "points: want real numbers, got dtype <U"),
+    ],
+)
+def test_points_that_are_none(tmp_path: Path, points: np.ndarray, message: str) -> None:
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}"):
+        write_points(tmp_path / "a.bin", points)
+    assert not (tmp_path / "a.bin").exists()
+
+
+@pytest.mark.filterwarnings("error")
+def test_points_of_any_number(tmp_path: Path) -> None:
+    """What is not finite, also once it is float32, is for the reader to drop, who says so."""
+    write_points(tmp_path / "a.bin", np.array([[1, 2, 3, 0], [np.nan, 0, 0, 0], [1e300, 0, 0, 0]]))
+    np.testing.assert_array_equal(read_points(tmp_path / "a.bin")[:, 0], [1, np.nan, np.inf])
+    write_points(tmp_path / "b.bin", np.array([[1, 2, 3, 0]] * 3))
+    assert read_points(tmp_path / "b.bin").tolist() == [[1, 2, 3, 0]] * 3

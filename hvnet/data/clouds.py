@@ -1,77 +1,186 @@
-"""Users' own point clouds: .bin (KITTI), .npy, .pcd and .ply files as (N, 4) float32."""
+"""Files of point clouds: .bin (KITTI and others), .npy, .pcd and .ply, as (N, 4) float32."""
 
 import struct
+import textwrap
 import tokenize
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyParseError
-from pypcd4 import PointCloud
 
-from hvnet.data.kitti import drop_non_finite, read_points
+from hvnet.config import DataConfig
+from hvnet.data.columns import COUNTS, FOUR, is_reflectance, read_numbers
+from hvnet.data.pcd import read_pcd
+from hvnet.data.sensor import (
+    Floats,
+    Reflectance,
+    dropped_note,
+    full_scale,
+    has_reflectance,
+    highest_reflectance,
+    judge_reflectance,
+)
 from hvnet.exceptions import InputError
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
-REFLECTANCE = ("reflectance", "intensity", "reflectivity", "i", "scalar_intensity")
-"""Names that other tools give to the reflectance."""
+SAMPLED_FILES = 16
+"""Files of a folder, or of a call, that tell the scale of the reflectance."""
 
 
-def read_cloud(path: Path) -> tuple[NDArray[np.float32], list[str]]:
+class RawCloud(NamedTuple):
+    """What a file holds, as it is."""
+
+    xyz: Floats  # (N, 3) metres
+    reflectance: Floats | None  # (N,) at the scale of the sensor; None if there is none
+    columns: str  # what its numbers are; files of one sensor have the same
+    note: str = ""  # what a user should know of how it was read
+
+
+class Cloud(NamedTuple):
+    """The points of a file."""
+
+    points: Floats  # (N, 4) x, y, z in metres, finite; reflectance in [0, 1]
+    reflectance: Reflectance
+    dropped: int  # points that were not finite
+
+
+def is_cloud(path: Path) -> bool:
+    """Whether a file has the suffix of a cloud, in any case."""
+    return path.suffix.lower() in SUFFIXES
+
+
+def read_cloud(path: Path, reading: DataConfig | None = None) -> tuple[Floats, list[str]]:
     """Points (N, 4) x, y, z in metres and reflectance in [0, 1] of a file, and notes on what was changed while reading.
 
     A file without reflectance gets 0, one that counts it beyond 1 is divided by 255 or, if that is too little, by
     65535; points that are not finite are dropped. Raises InputError naming the file.
     """
-    if path.suffix == ".bin":
-        points = read_points(path)
-    elif path.suffix == ".npy":
-        points = _read_npy(path)
-    elif path.suffix in (".pcd", ".ply"):
-        points = _join(_read_fields(path), path)
-    else:
-        raise InputError(f"{path}: unknown kind of file; known: {', '.join(SUFFIXES)}")
-    points, dropped = drop_non_finite(points)
-    notes = [f"{path}: {dropped} points that are not finite were dropped"] if dropped else []
-    if points.shape[1] == 3:
-        points = np.concatenate((points, np.zeros_like(points[:, :1])), axis=1)
-        notes.append(f"{path}: has no reflectance; 0 is used, which makes detection worse")
-    highest = float(points[:, 3].max(initial=0))
-    if highest > 1:
-        scale = next((full for full in (255.0, 65535.0) if highest <= full), highest)  # 8 bits, 16 bits, else unknown
-        points[:, 3] /= scale
-        notes.append(f"{path}: reflectance up to {highest:g} was divided by {scale:g}")
-    return points, notes
+    raw = read_raw(path, () if reading is None else reading.columns)
+    cloud = judge(raw, find_scale([raw], reading))
+    notes = [dropped_note(cloud.dropped)] if cloud.dropped else []
+    note = cloud.reflectance.note.replace("reflectance was", f"reflectance up to {cloud.reflectance.highest:g} was")
+    notes += [text for text in (raw.note, note) if text]
+    return cloud.points, [f"{path}: {note}" for note in notes]
 
 
-def _read_npy(path: Path) -> NDArray[np.float32]:
+def read_raw(path: Path, columns: Sequence[str] = ()) -> RawCloud:
+    """What a file holds; `columns` name the numbers of a .bin or .npy, else they are found out.
+
+    Raises InputError naming the file.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".bin":
+        rows, layout = read_numbers(_read_bytes(path), path, columns)
+        found = layout != FOUR and not columns
+        note = f"read as {layout}: {', '.join(layout.names)}; --columns says otherwise" if found else ""
+        return _raw({name: rows[:, k] for k, name in enumerate(layout.names) if name != "_"}, str(layout), note)
+    if suffix == ".npy":
+        return _read_npy(path, columns)
+    if suffix in (".pcd", ".ply"):
+        return _pick(read_pcd(path) if suffix == ".pcd" else _read_ply(path), path)
+    raise InputError(f"{path}: unknown kind of file; known: {', '.join(SUFFIXES)}")
+
+
+def find_scale(clouds: Sequence[RawCloud], reading: DataConfig | None = None) -> float:
+    """What the reflectance of these clouds of one sensor is to be divided by, unless the user says it."""
+    if reading is not None and reading.reflectance_scale is not None:
+        return reading.reflectance_scale
+    values = [cloud.reflectance for cloud in clouds if cloud.reflectance is not None]
+    return full_scale(max([highest_reflectance(each) for each in values if has_reflectance(each)], default=0.0))
+
+
+def find_scales(paths: Sequence[Path], reading: DataConfig) -> dict[str, float]:
+    """The scale of every kind of columns among these files: one sensor has one scale, however dark a cloud is.
+
+    Of many files some are looked at. A file that cannot be read tells nothing here: it is named when its turn comes.
+    """
+    step = max(1, len(paths) // SAMPLED_FILES)
+    kinds: dict[str, list[RawCloud]] = {}
+    for path in paths[::step]:
+        try:
+            raw = read_raw(path, reading.columns)
+        except (InputError, OSError):
+            continue
+        kinds.setdefault(raw.columns, []).append(raw)
+    return {columns: find_scale(clouds, reading) for columns, clouds in kinds.items()}
+
+
+def judge(raw: RawCloud, scale: float) -> Cloud:
+    """The points of a file, its reflectance divided by the scale. Points that are not finite are dropped.
+
+    A reflectance that is NaN counts as none, and its point stays.
+    """
+    kept = np.asarray(np.isfinite(raw.xyz).all(axis=1))
+    if raw.reflectance is not None:
+        kept &= ~np.isinf(raw.reflectance)
+    dropped = int(len(kept) - kept.sum())
+    if dropped:
+        raw = raw._replace(xyz=raw.xyz[kept], reflectance=None if raw.reflectance is None else raw.reflectance[kept])
+    reflectance = judge_reflectance(raw.reflectance, len(raw.xyz), scale)
+    return Cloud(np.column_stack((raw.xyz, reflectance.values)), reflectance, dropped)
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def _read_npy(path: Path, columns: Sequence[str]) -> RawCloud:
     try:
         with path.open("rb") as file:  # np.load would also accept other formats
-            points = np.lib.format.read_array(file, allow_pickle=False)
+            rows = np.lib.format.read_array(file, allow_pickle=False)
     except (OSError, ValueError, MemoryError, tokenize.TokenError) as error:
         raise InputError(f"{path}: cannot be read as .npy ({error}); save it with numpy.save") from error
-    if points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
-        raise InputError(f"{path}: want numbers (N, 3) or (N, 4), got {points.dtype} {points.shape}")
-    return points[:, :4].astype(np.float32)
+    if rows.ndim != 2 or rows.shape[1] < 3 or rows.dtype.kind not in "fiu":
+        raise InputError(f"{path}: want numbers (N, 3) or (N, 4), got {rows.dtype} {rows.shape}")
+    count = rows.shape[1]
+    if rows.shape[0] in (3, 4) and count > 16:
+        raise InputError(f"{path}: is transposed, {rows.shape}; save its .T, which is {rows.shape[::-1]}")
+    if columns and len(columns) != count:
+        raise InputError(f"{path}: has {count} numbers a point, and --columns names {len(columns)}")
+    names = columns or COUNTS[min(count, 4)]
+    return _raw({name: rows[:, k] for k, name in enumerate(names) if name != "_"}, f"{count} numbers a point")
 
 
-def _read_fields(path: Path) -> dict[str, NDArray]:
-    """The columns of a .pcd or .ply file by name."""
+def _read_ply(path: Path) -> dict[str, NDArray]:
+    """The columns of a .ply file by name."""
     try:
-        if path.suffix == ".pcd":
-            cloud = PointCloud.from_path(path)
-            return {name: cloud.pc_data[name].reshape(-1) for name in cloud.fields}
         vertices = PlyData.read(str(path))["vertex"]
         return {field.name: np.asarray(vertices[field.name]) for field in vertices.properties}
     except (OSError, ValueError, KeyError, IndexError, RuntimeError, struct.error, PlyParseError) as error:
         what = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: cannot be read as {path.suffix} ({what}); write it again or convert it") from error
+        raise InputError(f"{path}: cannot be read as .ply ({what}); write it again or convert it") from error
 
 
-def _join(fields: Mapping[str, NDArray], path: Path) -> NDArray[np.float32]:
-    missing = [name for name in ("x", "y", "z") if name not in fields]
+def _pick(fields: Mapping[str, NDArray], path: Path) -> RawCloud:
+    """The coordinates and the reflectance among the fields of a file."""
+    lower = {name.lower(): name for name in reversed(list(fields))}
+    missing = [axis for axis in "xyz" if axis not in lower]
     if missing:
-        raise InputError(f"{path}: has no field {missing[0]}; its fields are {', '.join(fields)}")
-    names = ["x", "y", "z", *[name for name in fields if name.lower() in REFLECTANCE][:1]]
-    return np.stack([np.asarray(fields[name], dtype=np.float32) for name in names], axis=1)
+        raise InputError(f"{path}: has no field {missing[0]}; its fields are {_listed(fields)}")
+    chosen = {axis: fields[lower[axis]] for axis in "xyz"}
+    named = [name for name in fields if is_reflectance(name)]
+    if named:
+        chosen["i"] = fields[named[0]]
+    others = [name for name in fields if name.lower() not in ("x", "y", "z")]
+    note = ""
+    if not named and others:
+        note = f"none of the fields {_listed(others)} has a name of the reflectance, such as intensity"
+    return _raw(chosen, ", ".join(fields), note)
+
+
+def _listed(names: Iterable[str]) -> str:
+    """Names of fields, as many as a line holds."""
+    return textwrap.shorten(", ".join(names), 200, placeholder=" ...")
+
+
+def _raw(chosen: Mapping[str, NDArray], columns: str, note: str = "") -> RawCloud:
+    with np.errstate(all="ignore"):  # numbers too large for float32 are infinite, and dropped
+        xyz = np.stack([np.asarray(chosen[axis], dtype=np.float32) for axis in "xyz"], axis=1)
+        reflectance = np.asarray(chosen["i"], dtype=np.float32) if "i" in chosen else None
+    return RawCloud(xyz, reflectance, columns, note)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from hvnet.boxes import EDGES, box_corners
 from hvnet.data.labels import Labels
+from hvnet.data.sensor import as_points, dropped_note
 from hvnet.exceptions import InputError
 
 Floats = NDArray[np.float64]
@@ -33,7 +34,8 @@ NEAR = 0.1
 class Camera:
     """A rectified camera and where it is, as KITTI's calib files have it, the size of its image and the image itself.
 
-    The pixel of a LiDAR point is p2 (r0_rect velo_to_cam x), divided by its depth.
+    The pixel of a LiDAR point is p2 (r0_rect velo_to_cam x), divided by its depth. Numbers so large that they overflow
+    raise no warning: what they belong to is not visible.
     """
 
     p2: Floats  # (3, 4) rectified camera axes to pixels
@@ -55,17 +57,20 @@ class Camera:
     def _lidar_to_rectified(self) -> tuple[Floats, Floats]:
         return self.r0_rect @ self.velo_to_cam[:, :3], self.r0_rect @ self.velo_to_cam[:, 3]
 
+    @np.errstate(all="ignore")
     def to_camera(self, xyz: NDArray[np.floating]) -> Floats:
         """Points (N, 3) in LiDAR axes to rectified camera axes (x right, y down, z forward): (N, 3)."""
         rotation, shift = self._lidar_to_rectified()
         return xyz @ rotation.T + shift
 
+    @np.errstate(all="ignore")
     def to_lidar(self, xyz: NDArray[np.floating]) -> Floats:
         """Points (N, 3) in rectified camera axes to LiDAR axes (N, 3): the inverse of `to_camera`."""
         rotation, shift = self._lidar_to_rectified()
         # the printed rotations have seven digits: their transpose is not quite their inverse
         return (xyz - shift) @ np.linalg.inv(rotation).T
 
+    @np.errstate(all="ignore")
     def homogeneous(self, xyz: NDArray[np.floating]) -> Floats:
         """Homogeneous pixels (N, 3) = (u * depth, v * depth, depth) of points (N, 3) in LiDAR axes."""
         rotation, shift = self._lidar_to_rectified()
@@ -74,6 +79,7 @@ class Camera:
         columns += (self.p2[:, :3] @ shift + self.p2[:, 3])[:, None]
         return columns.T
 
+    @np.errstate(all="ignore")
     def project(self, xyz: NDArray[np.floating]) -> tuple[Floats, Floats]:
         """Pixels (N, 2) and depth (N,) in metres of points (N, 3) in LiDAR axes.
 
@@ -81,15 +87,16 @@ class Camera:
         """
         projected = self.homogeneous(xyz)
         depth = projected[:, 2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return projected[:, :2] / depth[:, None], depth
+        return projected[:, :2] / depth[:, None], depth
 
     def sees(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Which of the points (N, 3 or more) in LiDAR axes are in front of the camera and inside the image: (N,)."""
         uv, depth = self.project(points[:, :3])
         u, v = uv.T
-        return (depth > 0) & (u >= 0) & (u < self.size[0]) & (v >= 0) & (v < self.size[1])
+        in_front = (depth > 0) & (depth < np.inf)
+        return in_front & (u >= 0) & (u < self.size[0]) & (v >= 0) & (v < self.size[1])
 
+    @np.errstate(all="ignore")
     def project_boxes(self, boxes: NDArray[np.floating]) -> tuple[Floats, NDArray[np.bool_]]:
         """2D boxes (M, 4) = left, top, right, bottom of boxes (M, 7), clipped to the image, and which are visible (M,).
 
@@ -102,8 +109,7 @@ class Camera:
         begin, end = corners[:, EDGES[:, 0]], corners[:, EDGES[:, 1]]  # (M, 12, 3)
         crosses = (begin[..., 2] < NEAR) != (end[..., 2] < NEAR)
         share = np.where(crosses, NEAR - begin[..., 2], 0) / np.where(crosses, end[..., 2] - begin[..., 2], 1)
-        with np.errstate(all="ignore"):  # boxes of absurd size overflow
-            outline = np.concatenate((corners, begin + share[..., None] * (end - begin)), axis=1)  # (M, 20, 3)
+        outline = np.concatenate((corners, begin + share[..., None] * (end - begin)), axis=1)  # (M, 20, 3)
         front = np.concatenate((corners[..., 2] >= NEAR, crosses), axis=1)
         pixels = outline[..., :2] / np.where(front, outline[..., 2], 1)[..., None]
         least = np.where(front[..., None], pixels, np.inf).min(axis=1)
@@ -113,6 +119,7 @@ class Camera:
         bbox = np.concatenate((least.clip(0, limit), most.clip(0, limit)), axis=1)
         return np.where(visible[:, None], bbox, 0), visible
 
+    @np.errstate(all="ignore")
     def project_lines(self, begin: Floats, end: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Pixels (K, 2, 2) of what the camera sees of lines from begin (S, 3) to end (S, 3), and which it sees (S,).
 
@@ -121,14 +128,17 @@ class Camera:
         """
         begin, end = self.homogeneous(begin), self.homogeneous(end)
         a, b = self._distances(begin), self._distances(end)  # (S, 5)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            share = a / (a - b)
+        share = a / (a - b)
         first = np.where((a < 0) & (b >= 0), share, 0).max(axis=1)[:, None]
         last = np.where((a >= 0) & (b < 0), share, 1).min(axis=1)[:, None]
         seen = ~((a < 0) & (b < 0)).any(axis=1) & (first < last)[:, 0]
         parts = np.stack((begin + first * (end - begin), begin + last * (end - begin)), axis=1)[seen]  # (K, 2, 3)
-        return parts[..., :2] / parts[..., 2:], seen
+        lines = parts[..., :2] / parts[..., 2:]
+        finite = np.isfinite(lines).all(axis=(1, 2))
+        seen[seen] = finite
+        return lines[finite], seen
 
+    @np.errstate(all="ignore")
     def project_polygon(self, corners: Floats) -> Floats:
         """Pixels (Q, 2) of what the camera sees of a convex polygon (P, 3), none if nothing (Sutherland, Hodgman)."""
         polygon = self.homogeneous(corners)
@@ -143,7 +153,8 @@ class Camera:
                 if values[k] >= 0:
                     kept.append(polygon[k])
             polygon = np.array(kept).reshape(-1, 3)
-        return polygon[:, :2] / polygon[:, 2:]
+        pixels = polygon[:, :2] / polygon[:, 2:]
+        return pixels if np.isfinite(pixels).all() else pixels[:0]
 
     def _distances(self, pixels: Floats) -> Floats:
         """How far homogeneous pixels (S, 3) are inside the near plane and the image's four borders: (S, 5)."""
@@ -182,18 +193,25 @@ class Objects:
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame, whatever it was read from. Arrays are converted to tensors."""
+    """One frame, whatever it was read from. Arrays are converted to tensors.
+
+    Points that are not finite are dropped, which is noted; a reflectance that is NaN, or the same everywhere, is 0.
+    """
 
     name: str
     points: Tensor  # (N, 4) float32 x, y, z in metres, reflectance in [0, 1]; finite
     objects: Objects | None = None  # None where nothing is labelled
     camera: Camera | None = None  # None where there is none
     notes: list[str] = field(default_factory=list)  # what a user should know of the frame's files
+    reflectance: str = "reflectance as is"  # what was done to it
+    in_view: str = ""  # how many of the points a camera sees
 
     def __post_init__(self) -> None:
-        points = torch.as_tensor(self.points, dtype=torch.float32)
-        if points.ndim != 2 or points.shape[1] != 4:
-            raise ValueError(f"points: want shape (N, 4) with x, y, z, reflectance, got {tuple(points.shape)}")
+        points = as_points(self.points)
+        finite = points.isfinite().all(dim=1)
+        if not finite.all():
+            points = points[finite]
+            self.notes.append(f"frame {self.name}: {dropped_note(int((~finite).sum()))}")
         object.__setattr__(self, "points", points)
 
     def boxes_of(self, classes: Sequence[str]) -> Tensor:
@@ -204,8 +222,9 @@ class Frame:
 class Frames(Protocol):
     """A sequence of frames: what training, validation, detection, evaluation, viewer and figures take.
 
-    A data format is a class with these three. It may also have a method `object_names(k)` that reads less than `[k]`;
-    see the function of this name.
+    A data format is a class with these three. It may also have a method `object_names(k)` that reads less than `[k]`,
+    `notes`, what a user should know of all frames, and a method `stamp(k)`, which tells whether files have changed; see
+    the functions of these names, the last one in `hvnet.data.stamps`.
     """
 
     @property
@@ -227,6 +246,11 @@ def object_names(frames: Frames, k: int) -> Sequence[str] | None:
         return own(k)
     objects = frame_at(frames, k).objects
     return None if objects is None else objects.names
+
+
+def notes(frames: Frames) -> Sequence[str]:
+    """What a user should know of all frames together."""
+    return getattr(frames, "notes", ())
 
 
 def frame_at(frames: Frames, k: int) -> Frame:

@@ -6,7 +6,8 @@ on writing, and a `Frame` is in LiDAR axes.
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +17,19 @@ from PIL import Image
 from torch import Tensor
 
 from hvnet.boxes import limit_angle
+from hvnet.config import DataConfig
+from hvnet.data.clouds import find_scales, judge, read_raw
 from hvnet.data.frame import IMAGE_ERRORS, IMAGE_SIZE, Camera, Frame, Objects
-from hvnet.data.labels import DONTCARE, Floats, Labels
+from hvnet.data.labels import DONTCARE, Floats, Labels, rename
+from hvnet.data.sensor import dropped_note
+from hvnet.data.stamps import Stamp, stamp_files
 from hvnet.exceptions import InputError
 
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
 """The classes of KITTI's label files."""
+IMAGES = (".png", ".jpg", ".jpeg")
+FEW_SEEN = 0.02
+"""Share of a cloud's points below which the camera's view is suspicious: KITTI's sees 0.15 of whole scans."""
 
 # camera axes at the LiDAR, looking along its x: those of the labels if there is no camera
 AT_LIDAR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
@@ -30,8 +38,10 @@ AT_LIDAR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 class KittiFrames:
     """Frames of a KITTI root, training/ or testing/: a `Frames`.
 
-    labelled: True requires and reads the labels, False does not read them, None reads those that exist.
+    labelled: True requires and reads the labels, False does not read them, None reads those that there are; one that
+    cannot be read is then noted, and its frame counts as not labelled.
     crop: keep only the points in the camera's view, where objects are labelled.
+    reading: how clouds and labels are read; what it does not say is found out.
     """
 
     def __init__(
@@ -42,37 +52,94 @@ class KittiFrames:
         *,
         labelled: bool | None = True,
         crop: bool = True,
+        reading: DataConfig | None = None,
     ) -> None:
         self.root, self.names, self.split_dir = Path(root), list(names), split_dir
-        self.labelled, self.crop = labelled, crop
+        self.labelled, self.crop, self.reading = labelled, crop, reading or DataConfig()
+        self.folder = self.root / split_dir
 
     def __len__(self) -> int:
         return len(self.names)
 
     def __getitem__(self, k: int) -> Frame:
-        labelled = self.is_labelled(k)
-        return read_frame(self.root, self.names[k], self.split_dir, labelled=labelled, crop=self.crop)
+        name = self.names[k]
+        labels, note = self.labels(k)
+        camera = frame_camera(self.folder, name, labels or _labels([]))
+        path = find_file(self.folder / "velodyne", name, ".bin")
+        raw = read_raw(path, self.reading.columns)
+        cloud = judge(raw, self.scales.get(raw.columns, 1.0))
+        points, in_view = cloud.points, ""
+        notes = [f"frame {name}: {dropped_note(cloud.dropped)}"] if cloud.dropped else []
+        # the same for all clouds, so that they are said once
+        facts_of_all = [f"{self.folder / 'velodyne'}: {text}" for text in (raw.note, cloud.reflectance.note) if text]
+        notes += [note] * bool(note) + facts_of_all
+        if self.crop and camera is not None:
+            seen = camera.sees(points)
+            in_view = f"{seen.sum():,} of {len(seen):,} points in the camera's view"
+            if reason := view_reason(camera, seen):
+                notes.append(f"frame {name}: {reason}")
+            points = points[seen]
+        objects = None
+        if labels is not None:
+            rows = labels.select(labels.name != DONTCARE)
+            boxes = torch.from_numpy(boxes_to_lidar(rows, camera)).float()
+            try:
+                objects = Objects(boxes, rows.name.tolist(), labels)
+            except ValueError as error:
+                raise InputError(f"{find_file(self.folder / 'label_2', name, '.txt')}: {error}") from error
+        return Frame(name, torch.from_numpy(points), objects, camera, notes, cloud.reflectance.fact, in_view)
 
-    def is_labelled(self, k: int) -> bool:
-        """Whether frame k has, or must have, a label file."""
-        if self.labelled is not None:
-            return self.labelled
-        return (self.root / self.split_dir / "label_2" / f"{self.names[k]}.txt").is_file()
+    def labels(self, k: int) -> tuple[Labels | None, str]:
+        """The labels of frame k, None if it has none, and what is wrong with a file that cannot be read.
+
+        Raises InputError for such a file if frames have to be labelled.
+        """
+        path = find_file(self.folder / "label_2", self.names[k], ".txt")
+        if self.labelled is False or (self.labelled is None and not path.is_file()):
+            return None, ""
+        try:
+            labels = rename(read_labels(path), self.reading.classes)
+            if not has_camera(self.folder):
+                check_without_camera(self.folder, self.names[k], labels)
+            return labels, ""
+        except InputError as error:
+            if self.labelled:
+                raise
+            return None, f"{error}; the frame counts as not labelled"
 
     def object_names(self, k: int) -> list[str] | None:
         """See `frame.object_names`: reads the small files of frame k, and only the size of its cloud."""
-        folder, name = self.root / self.split_dir, self.names[k]
-        labels = read_labels(folder / "label_2" / f"{name}.txt") if self.is_labelled(k) else _labels([])
-        frame_camera(folder, name, labels)
-        points = folder / "velodyne" / f"{name}.bin"
+        labels, _ = self.labels(k)
+        frame_camera(self.folder, self.names[k], labels or _labels([]))
+        points = find_file(self.folder / "velodyne", self.names[k], ".bin")
         if not points.is_file() or points.stat().st_size % 16:
-            read_points(points)  # which says what is wrong
-        return [str(each) for each in labels.name if each != DONTCARE] if self.is_labelled(k) else None
+            read_raw(points, self.reading.columns)  # which says what is wrong
+        return None if labels is None else [str(each) for each in labels.name if each != DONTCARE]
+
+    def stamp(self, k: int) -> Stamp:
+        """See `stamps.stamp_of`: which label file, calibration and cloud frame k is read from, and how."""
+        name = self.names[k]
+        small = [find_file(self.folder / folder, name, ".txt") for folder in ("label_2", "calib")]
+        return stamp_files(small, repr(self.reading), find_file(self.folder / "velodyne", name, ".bin"))
+
+    @cached_property
+    def scales(self) -> dict[str, float]:
+        """The scale of the reflectance of the root's clouds, by their columns."""
+        return find_scales(cloud_files(self.folder), self.reading)
+
+    @property
+    def notes(self) -> list[str]:
+        """See `frame.notes`: how many frames have no image, if there are images."""
+        folder = self.folder / "image_2"
+        missing = sum(not find_file(folder, name, *IMAGES).is_file() for name in self.names) if folder.is_dir() else 0
+        size = f"{IMAGE_SIZE[0]} x {IMAGE_SIZE[1]}"
+        note = f"{folder}: has no image of {missing} of {len(self)} frames; their size is taken to be {size}"
+        return [note] if missing else []
 
 
-def read_split_frames(root: Path, name: str) -> KittiFrames:
+def read_split_frames(root: Path, name: str, reading: DataConfig | None = None) -> KittiFrames:
     """The labelled frames of ImageSets/NAME.txt of a KITTI root."""
-    return KittiFrames(root, read_split(root, name))
+    return KittiFrames(root, read_split(root, name), reading=reading)
 
 
 def read_frame(
@@ -80,25 +147,37 @@ def read_frame(
 ) -> Frame:
     """Reads one frame of a KITTI root; `crop` keeps only the points in the camera's view, where objects are labelled.
 
-    The size of the image is that of image_2/ID.png; without this file it is taken to be 1242 x 375. Where there is no
-    folder calib there is no camera: all points are kept, and labels are in camera axes at the LiDAR (AT_LIDAR).
+    The size of the image is that of image_2/ID.png (or .jpg); without this file it is taken to be 1242 x 375. Where
+    there is no folder calib there is no camera: all points are kept, and labels are in camera axes at the LiDAR
+    (AT_LIDAR).
     """
-    folder = Path(root) / split_dir
-    labels = read_labels(folder / "label_2" / f"{frame_id}.txt") if labelled else _labels([])
-    camera = frame_camera(folder, frame_id, labels)
-    points, dropped = drop_non_finite(read_points(folder / "velodyne" / f"{frame_id}.bin"))
-    if crop and camera is not None:
-        points = points[camera.sees(points)]
-    notes = [f"frame {frame_id}: {dropped} points that are not finite were dropped"] if dropped else []
-    objects = None
-    if labelled:
-        rows = labels.select(labels.name != DONTCARE)
-        boxes = torch.from_numpy(boxes_to_lidar(rows, camera)).float()
-        try:
-            objects = Objects(boxes, rows.name.tolist(), labels)
-        except ValueError as error:
-            raise InputError(f"{folder / 'label_2' / frame_id}.txt: {error}") from error
-    return Frame(frame_id, torch.from_numpy(points), objects, camera, notes)
+    return KittiFrames(root, [frame_id], split_dir, labelled=labelled, crop=crop)[0]
+
+
+def find_file(folder: Path, name: str, *suffixes: str) -> Path:
+    """The file of this name with one of the suffixes, in lower, upper or title case; if none is there, the first."""
+    paths = [folder / (name + each) for suffix in suffixes for each in (suffix, suffix.upper(), suffix.title())]
+    return next((path for path in paths if path.is_file()), paths[0])
+
+
+def cloud_files(folder: Path) -> list[Path]:
+    """The clouds of a folder such as training/, sorted."""
+    return sorted(file for file in (folder / "velodyne").glob("*") if file.suffix.lower() == ".bin")
+
+
+def view_reason(camera: Camera, seen: NDArray[np.bool_]) -> str:
+    """Why a camera sees next to nothing of a cloud (N,), with the remedy; empty if it sees something."""
+    if seen.sum() >= FEW_SEEN * len(seen) and len(seen):
+        return ""
+    if not len(seen):
+        return "the cloud has no points"
+    what = f"its camera sees {seen.sum():,} of {len(seen):,} points"
+    remedy = "give the calibration of these clouds or, without a camera, remove calib"
+    if np.allclose(camera.r0_rect @ camera.velo_to_cam[:, :3], np.eye(3), atol=0.01):
+        return f"{what}: Tr_velo_to_cam is the identity, and a camera's axes are x right, y down, z forward; {remedy}"
+    if camera.image is None:
+        return f"{what}: its image, whose size would count, is missing, or its calibration is another's; {remedy}"
+    return f"{what}; {remedy}"
 
 
 def has_camera(folder: Path) -> bool:
@@ -122,15 +201,20 @@ def frame_camera(folder: Path, frame_id: str, labels: Labels) -> Camera | None:
     Raises InputError where labels have 2D boxes and there is no calibration: their axes are those of a camera.
     """
     if has_camera(folder):
-        image = folder / "image_2" / f"{frame_id}.png"
-        camera = read_calibration(folder / "calib" / f"{frame_id}.txt")
+        image = find_file(folder / "image_2", frame_id, *IMAGES)
+        camera = read_calibration(find_file(folder / "calib", frame_id, ".txt"))
         return replace(camera, size=_image_size(image), image=image) if image.is_file() else camera
+    check_without_camera(folder, frame_id, labels)
+    return None
+
+
+def check_without_camera(folder: Path, frame_id: str, labels: Labels) -> None:
+    """Raises InputError for labels with 2D boxes, whose axes must be those of a camera that is not there."""
     if (labels.bbox[:, 2:] > labels.bbox[:, :2]).any():
         raise InputError(
             f"{folder / 'calib'}: no such folder, but the labels of frame {frame_id} have 2D boxes; "
             "add it, or, without a camera, make the 2D boxes -1"
         )
-    return None
 
 
 def read_split(root: Path, name: str, split_dir: str = "training", labelled: bool = True) -> list[str]:
@@ -150,7 +234,7 @@ def read_split(root: Path, name: str, split_dir: str = "training", labelled: boo
         if frame_id in lines:
             raise InputError(f"{path}:{number}: frame {frame_id} is already on line {lines[frame_id]}; remove one")
         for folder, suffix in suffixes.items():
-            file = Path(root) / split_dir / folder / (frame_id + suffix)
+            file = find_file(Path(root) / split_dir / folder, frame_id, suffix)
             if not file.is_file():
                 raise InputError(f"{path}:{number}: frame {frame_id} has no {file}; add the file or remove the line")
         lines[frame_id] = number
@@ -160,22 +244,20 @@ def read_split(root: Path, name: str, split_dir: str = "training", labelled: boo
 
 
 def read_points(path: Path) -> NDArray[np.float32]:
-    """Points (N, 4) of a velodyne .bin file: x, y, z in metres and reflectance in [0, 1], float32 little-endian."""
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    if len(data) % 16:
-        raise InputError(
-            f"{path}: {len(data)} bytes are no multiple of 16, the size of a point (x, y, z, reflectance as float32); "
-            "is the file cut off?"
-        )
-    return np.frombuffer(bytearray(data), dtype="<f4").reshape(-1, 4)
+    """Points (N, 4) of a velodyne .bin file as they are: x, y, z in metres and the reflectance, 0 if there is none."""
+    raw = read_raw(Path(path))
+    reflectance = np.zeros(len(raw.xyz), np.float32) if raw.reflectance is None else raw.reflectance
+    return np.column_stack((raw.xyz, reflectance))
 
 
 def write_points(path: Path, points: NDArray[np.float32]) -> None:
-    """Writes points (N, 4) as a velodyne .bin file."""
-    Path(path).write_bytes(np.ascontiguousarray(points, dtype="<f4").tobytes())
+    """Writes points (N, 4) as a velodyne .bin file. Raises ValueError for another shape, and for what is no number."""
+    points = np.asarray(points)
+    if points.ndim != 2 or points.shape[1] != 4:
+        raise ValueError(f"points: want shape (N, 4) with x, y, z, reflectance, got {points.shape}")
+    _check_real("points", points)
+    with np.errstate(over="ignore"):  # what is too large for float32 is infinite, and dropped by who reads it
+        Path(path).write_bytes(np.ascontiguousarray(points, dtype="<f4").tobytes())
 
 
 def drop_non_finite(points: NDArray[np.float32]) -> tuple[NDArray[np.float32], int]:
@@ -186,15 +268,20 @@ def drop_non_finite(points: NDArray[np.float32]) -> tuple[NDArray[np.float32], i
     return points[finite], int((~finite).sum())
 
 
-def read_labels(path: Path, scored: bool = False) -> Labels:
-    """Reads a label file, or a result file, whose lines end with a score (`scored`). An empty file means no objects."""
+def read_labels(path: Path, scored: bool = False, *, needs_3d: bool = True) -> Labels:
+    """Reads a label file, or a result file, whose lines end with a score (`scored`). An empty file means no objects.
+
+    A 16th field in a label file, such as a score or an id of another tool, is ignored. Results may come without 3D
+    boxes; so may labels, their three dimensions not positive, unless `needs_3d`.
+    """
     lines = _read_lines(path, "the objects of a frame, one a line")
     rows = [line.split() for line in lines]
-    size = 16 if scored else 15
+    sizes = (16,) if scored else (15, 16)
     for number, row in enumerate(rows, 1):
-        if row and len(row) != size:
-            expected = f"{size} (class, 14 numbers{' and a score' if scored else ''})"
+        if row and len(row) not in sizes:
+            expected = "16 (class, 14 numbers and a score)" if scored else "15 (class, 14 numbers; a 16th is ignored)"
             raise InputError(f"{path}:{number}: {len(row)} fields, expected {expected}")
+    rows = [row[: sizes[0]] for row in rows]
     try:
         labels = _labels([row for row in rows if row], scored)
     except ValueError:
@@ -204,10 +291,14 @@ def read_labels(path: Path, scored: bool = False) -> Labels:
                     kind = "whole number" if field == 3 else "finite number"
                     raise InputError(f"{path}:{number}: field {field} is '{text[:60]}', not a {kind}") from None
         raise
-    flat = (labels.dimensions <= 0).any(axis=1) & (labels.name != DONTCARE)
-    if flat.any() and not scored:  # results may come without 3D boxes
-        number = [number for number, row in enumerate(rows, 1) if row][flat.argmax()]
-        raise InputError(f"{path}:{number}: height, width or length (fields 9 to 11) is not positive")
+    flat = (labels.dimensions <= 0) & (labels.name != DONTCARE)[:, None]
+    wrong = flat.any(axis=1) & (needs_3d | ~flat.all(axis=1))
+    if wrong.any() and not scored:
+        number = [number for number, row in enumerate(rows, 1) if row][wrong.argmax()]
+        raise InputError(
+            f"{path}:{number}: height, width or length (fields 9 to 11) is not positive; give the object's size in "
+            "metres, or remove the line"
+        )
     return labels
 
 
@@ -240,22 +331,31 @@ def _is_number(text: str, whole: bool) -> bool:
 def write_labels(path: Path, labels: Labels) -> None:
     """Writes a label file with two decimals, as KITTI's are, or, where there are scores, a result file with four.
 
-    Raises ValueError for a class that is not one word: such a file could not be read.
+    Raises ValueError, and writes nothing, for what could not be read: a class that is not one word, a number that is
+    not finite, an occlusion that is not whole, and in a label file a size of an object that is 0.00 or less.
     """
-    split = [str(name) for name in labels.name if len(str(name).split()) != 1]
-    if split:
-        raise ValueError(f"labels: want classes of one word each, got '{split[0]}'")
+    _check_names("labels", labels.name.tolist())
+    for field in fields(labels):
+        column = getattr(labels, field.name)
+        if column is not None and field.name != "name":
+            _check_finite(f"labels.{field.name}", column)
+    whole = labels.occlusion == np.trunc(labels.occlusion)
+    if not whole.all():
+        raise ValueError(f"labels.occlusion: want whole numbers, got {labels.occlusion[~whole][0]}")
     digits = 2 if labels.score is None else 4
     lines = []
     for k in range(len(labels)):
         # KITTI writes a number that is unknown, and all of DontCare but its 2D box, as a whole one
         unknown = labels.name[k] == DONTCARE
         after = 0 if unknown else digits
-        numbers = [f"{labels.truncation[k]:.{0 if labels.truncation[k] < 0 else 2}f}", f"{labels.occlusion[k]}"]
+        numbers = [f"{labels.truncation[k]:.{0 if labels.truncation[k] < 0 else 2}f}", f"{int(labels.occlusion[k])}"]
         numbers.append(f"{labels.alpha[k]:.{after}f}")
         numbers += [f"{value:.{digits}f}" for value in labels.bbox[k]]
-        for value in (*labels.dimensions[k], *labels.location[k], labels.rotation_y[k]):
-            numbers.append(f"{value:.{after}f}")
+        size = [f"{value:.{after}f}" for value in labels.dimensions[k]]
+        if labels.score is None and not unknown and min(map(float, size)) <= 0:
+            raise ValueError(f"labels.dimensions: want sizes of 0.01 and more in row {k}, got {labels.dimensions[k]}")
+        numbers += size
+        numbers += [f"{value:.{after}f}" for value in (*labels.location[k], labels.rotation_y[k])]
         if labels.score is not None:
             numbers.append(f"{labels.score[k]:.6f}")
         lines.append(" ".join((labels.name[k], *numbers)) + "\n")
@@ -280,7 +380,9 @@ def read_calibration(path: Path) -> Camera:
             if not _is_number(value, whole=False):
                 raise InputError(f"{path}:{number}: {key} holds '{value[:60]}', not a finite number")
         found[key] = np.array([float(value) for value in texts]).reshape(rows, columns)
-        if key != "P2" and abs(np.linalg.det(found[key][:, :3]) - 1) > 0.01:
+        with np.errstate(all="ignore"):
+            turns = key == "P2" or abs(np.linalg.det(found[key][:, :3]) - 1) <= 0.01
+        if not turns:
             raise InputError(f"{path}:{number}: {key} is no rotation: its determinant is not 1")
     missing = [key for key in shapes if key not in found]
     if missing:
@@ -339,7 +441,24 @@ def boxes_to_labels(
 
     Labels are neither truncated nor occluded; of results nothing is known about that. A box with nothing in the image
     is left out: nothing is labelled there. Without a camera there are no 2D boxes: they are -1.
+
+    Raises ValueError for another shape or number, for a name that is not one word, for numbers that are not finite and
+    for a label whose size is not above 0.
     """
+    boxes = np.asarray(boxes)
+    if boxes.ndim != 2 or boxes.shape[1] != 7:
+        raise ValueError(f"boxes: want shape (M, 7) with x, y, z, l, w, h, yaw, got {boxes.shape}")
+    _check_finite("boxes", boxes)
+    if len(names) != len(boxes):
+        raise ValueError(f"names: want one for each of the {len(boxes)} boxes, got {len(names)}")
+    _check_names("names", names)
+    if scores is not None:
+        scores = np.asarray(scores)
+        if scores.shape != (len(boxes),):
+            raise ValueError(f"scores: want one for each of the {len(boxes)} boxes, got shape {scores.shape}")
+        _check_finite("scores", scores)
+    elif (flat := (boxes[:, 3:6] <= 0).any(axis=1)).any():
+        raise ValueError(f"boxes: want l, w, h above 0, got {boxes[flat.argmax(), 3:6]} in row {flat.argmax()}")
     bbox, visible = np.full((len(boxes), 4), -1.0), np.ones(len(boxes), dtype=np.bool_)
     if camera is not None:
         bbox, visible = camera.project_boxes(boxes)
@@ -357,6 +476,23 @@ def boxes_to_labels(
         score=scores,
     )
     return labels.select(visible)
+
+
+def _check_names(argument: str, names: Sequence[str]) -> None:
+    split = [name for name in names if len(str(name).split()) != 1]
+    if split:
+        raise ValueError(f"{argument}: want classes of one word each, got '{split[0]}'")
+
+
+def _check_real(argument: str, values: NDArray) -> None:
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"{argument}: want real numbers, got dtype {values.dtype}")
+
+
+def _check_finite(argument: str, values: NDArray) -> None:
+    _check_real(argument, values)
+    if not np.isfinite(values).all():
+        raise ValueError(f"{argument}: want finite numbers, got {values[~np.isfinite(values)][0]}")
 
 
 def detections_to_labels(boxes: Tensor, scores: Tensor, names: Sequence[str], camera: Camera | None) -> Labels:
@@ -386,7 +522,7 @@ def _image_size(path: Path) -> tuple[int, int]:
 
 def _read_lines(path: Path, content: str) -> list[str]:
     try:
-        return Path(path).read_text(encoding="utf-8").splitlines()
+        return Path(path).read_text(encoding="utf-8-sig").splitlines()  # some editors begin with a byte order mark
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; it holds {content}") from error
     except OSError as error:

@@ -1,12 +1,14 @@
 """The rows of KITTI's label and result files, which its evaluation compares."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from hvnet.exceptions import InputError
 
 Floats = NDArray[np.float64]
 
@@ -50,9 +52,17 @@ class Labels:
         bottom = self.location[:, 1]
         return bottom - self.dimensions[:, 0], bottom
 
+    def has_2d(self) -> NDArray[np.bool_]:
+        """Which have a 2D box (K,): one with an area."""
+        return (self.bbox[:, 2] > self.bbox[:, 0]) & (self.bbox[:, 3] > self.bbox[:, 1])
+
+    def has_3d(self) -> NDArray[np.bool_]:
+        """Which have a 3D box (K,): one with a volume, at a place that is not -1000, KITTI's unknown."""
+        return (self.location != -1000).all(axis=1) & (self.dimensions > 0).all(axis=1)
+
     def ground_distance(self) -> Floats:
-        """Distance (K,) from the camera on the ground, in metres."""
-        return np.hypot(self.location[:, 0], self.location[:, 2])
+        """Distance (K,) from the camera on the ground, in metres; inf without a 3D box."""
+        return np.where(self.has_3d(), np.hypot(self.location[:, 0], self.location[:, 2]), np.inf)
 
 
 def concatenate(parts: Sequence[Labels]) -> Labels:
@@ -79,3 +89,28 @@ def count_others(names: Iterable[str], classes: Iterable[str]) -> str:
     """
     known = {*classes, DONTCARE}
     return ", ".join(f"{count} {name}" for name, count in Counter(names).most_common() if name not in known)
+
+
+def class_map(texts: Sequence[str]) -> dict[str, str]:
+    """The classes that other names count as, of texts such as "bicycle=Cyclist"; several may stand in one, with commas.
+
+    Raises InputError for anything else, for DontCare, and for a name given twice.
+    """
+    classes: dict[str, str] = {}
+    for text in (part for each in texts for part in each.split(",")):
+        name, _, meant = text.partition("=")
+        if name.split() != [name] or meant.split() != [meant] or "=" in meant:
+            raise InputError(f"--classes {text}: want NAME=CLASS, such as bicycle=Cyclist")
+        if DONTCARE in (name, meant):
+            raise InputError(f"--classes {text}: {DONTCARE} is a region of the image, no class")
+        if name in classes:
+            raise InputError(f"--classes {text}: {name} is given twice; leave one out")
+        classes[name] = meant
+    return classes
+
+
+def rename(labels: Labels, classes: Mapping[str, str]) -> Labels:
+    """The labels, with the names in `classes` replaced by the class that they count as."""
+    if not classes:
+        return labels
+    return replace(labels, name=np.array([classes.get(name, name) for name in labels.name.tolist()], dtype=np.str_))

@@ -1,31 +1,54 @@
 """The clouds that a user names: files, folders of files and KITTI roots, as one sequence of frames."""
 
+import os
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 
 import torch
 
-from hvnet.data.clouds import SUFFIXES, read_cloud
-from hvnet.data.frame import Frame, Frames, object_names
-from hvnet.data.kitti import KittiFrames, has_camera, read_split
+from hvnet.config import DataConfig
+from hvnet.data.clouds import SUFFIXES, find_scale, find_scales, is_cloud, judge, read_raw
+from hvnet.data.frame import Frame, Frames, notes, object_names
+from hvnet.data.kitti import KittiFrames, cloud_files, find_file, has_camera, read_split
+from hvnet.data.sensor import dropped_note
 from hvnet.exceptions import InputError
 
 
 class CloudFiles:
-    """Files of clouds, without labels and cameras: a `Frames`."""
+    """Files of clouds, without labels and cameras: a `Frames`.
 
-    def __init__(self, paths: Sequence[Path]) -> None:
+    reading: how they are read; what it does not say is found out.
+    siblings: files of the same call, which tell the scale of the reflectance as well.
+    """
+
+    def __init__(
+        self, paths: Sequence[Path], reading: DataConfig | None = None, siblings: Sequence[Path] | None = None
+    ) -> None:
         self.paths, self.names = list(paths), [path.stem for path in paths]
+        self.reading, self.siblings = reading or DataConfig(), self.paths if siblings is None else siblings
 
     def __len__(self) -> int:
         return len(self.paths)
 
     def __getitem__(self, k: int) -> Frame:
-        points, notes = read_cloud(self.paths[k])
-        return Frame(self.names[k], torch.from_numpy(points), notes=notes)
+        path = self.paths[k]
+        raw = read_raw(path, self.reading.columns)
+        scale = self.scales.get(raw.columns)
+        cloud = judge(raw, find_scale([raw], self.reading) if scale is None else scale)
+        said = [f"{path}: {dropped_note(cloud.dropped)}"] if cloud.dropped else []
+        said += [f"{path}: {raw.note}"] if raw.note else []
+        if note := cloud.reflectance.note:  # the same for all files, so that it is said once
+            said.append(f"{os.path.commonpath(self.siblings)}: {note}")
+        return Frame(self.names[k], torch.from_numpy(cloud.points), notes=said, reflectance=cloud.reflectance.fact)
 
     def object_names(self, k: int) -> None:
         """See `frame.object_names`: nothing is labelled."""
+
+    @cached_property
+    def scales(self) -> dict[str, float]:
+        """The scale of the reflectance of the files, by their columns."""
+        return find_scales(self.siblings, self.reading)
 
 
 class JoinedFrames:
@@ -48,6 +71,11 @@ class JoinedFrames:
         part, index = self.places[k]
         return part[index]
 
+    @property
+    def notes(self) -> list[str]:
+        """See `frame.notes`."""
+        return [note for part in self.parts for note in notes(part)]
+
     def object_names(self, k: int) -> Sequence[str] | None:
         """See `frame.object_names`."""
         part, index = self.places[k]
@@ -60,42 +88,53 @@ def _place(part: Frames, k: int) -> str:
     return str(part.root) if isinstance(part, KittiFrames) else part.names[k]
 
 
-def find_frames(inputs: Sequence[Path], split: str | None = None) -> JoinedFrames:
+def find_frames(
+    inputs: Sequence[Path], split: str | None = None, reading: DataConfig | None = None, *, crop: bool = True
+) -> JoinedFrames:
     """The frames of the inputs, in order; of KITTI roots those of ImageSets/SPLIT.txt, by default all.
+
+    reading: how clouds and labels are read. crop: of frames with a camera only what it sees.
 
     Raises InputError for an input that is missing or empty, or a name used twice.
     """
-    parts: list[Frames] = []
+    files: dict[Path, list[Path]] = {}  # of every input that is no KITTI root
     for path in inputs:
         if path.is_file():
-            if path.suffix not in SUFFIXES:
+            if not is_cloud(path):
                 raise InputError(f"{path}: unknown kind of file; known: {', '.join(SUFFIXES)}")
-            parts.append(CloudFiles([path]))
-        elif (path / "training").is_dir() or (path / "testing").is_dir():
-            parts.append(_find_kitti(path, split))
-        elif path.is_dir():
-            files = sorted(file for file in path.iterdir() if file.suffix in SUFFIXES)
-            if not files:
-                raise InputError(f"{path}: holds no cloud ({', '.join(SUFFIXES)}) and is no KITTI root")
-            parts.append(CloudFiles(files))
-        else:
+            files[path] = [path]
+        elif not path.is_dir():
             raise InputError(f"{path}: no such file or folder")
+        elif not _is_kitti(path):
+            files[path] = sorted(file for file in path.iterdir() if is_cloud(file) and file.is_file())
+            if not files[path]:
+                raise InputError(f"{path}: holds no cloud ({', '.join(SUFFIXES)}) and is no KITTI root")
+    siblings = [file for own in files.values() for file in own]
+    parts: list[Frames] = [
+        CloudFiles(files[path], reading, siblings) if path in files else _find_kitti(path, split, reading, crop)
+        for path in inputs
+    ]
     if split is not None and not any(isinstance(part, KittiFrames) for part in parts):
         raise InputError(f"--split {split}: none of the inputs is a KITTI root")
     return JoinedFrames(parts)
 
 
-def _find_kitti(root: Path, split: str | None) -> KittiFrames:
+def _is_kitti(path: Path) -> bool:
+    return (path / "training").is_dir() or (path / "testing").is_dir()
+
+
+def _find_kitti(root: Path, split: str | None, reading: DataConfig | None, crop: bool) -> KittiFrames:
     folder = "testing" if split == "test" or not (root / "training").is_dir() else "training"
     # the test set is all of its folder, and KITTI's own download names its frames nowhere
     if split is not None and (split != "test" or (root / "ImageSets" / "test.txt").is_file()):
-        return KittiFrames(root, read_split(root, split, split_dir=folder, labelled=False), folder, labelled=None)
-    names = sorted(file.stem for file in (root / folder / "velodyne").glob("*.bin"))
-    if not names:
-        raise InputError(f"{root / folder / 'velodyne'}: holds no .bin file")
-    if has_camera(root / folder):
-        for name in names:
-            calib = root / folder / "calib" / f"{name}.txt"
-            if not calib.is_file():
-                raise InputError(f"{calib}: no such file; each frame needs one")
-    return KittiFrames(root, names, folder, labelled=None)
+        names = read_split(root, split, split_dir=folder, labelled=False)
+    else:
+        names = [file.stem for file in cloud_files(root / folder)]
+        if not names:
+            raise InputError(f"{root / folder / 'velodyne'}: holds no .bin file")
+        if has_camera(root / folder):
+            for name in names:
+                calib = find_file(root / folder / "calib", name, ".txt")
+                if not calib.is_file():
+                    raise InputError(f"{calib}: no such file; each frame needs one")
+    return KittiFrames(root, names, folder, labelled=None, crop=crop, reading=reading)

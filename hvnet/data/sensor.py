@@ -1,0 +1,262 @@
+"""The one judge of a cloud: its reflectance, its ground, and what of it is in range, for files, roots and arrays alike.
+
+docs/sensors.md has the rules, and what they give on real sensors.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+Floats = NDArray[np.float32]
+
+FULL_SCALES = (1.0, 255.0, 65535.0)
+"""Largest reflectance of sensors that count up to 1, in 8 bits and in 16 bits."""
+TOLERANCE = 0.1
+"""By how much a reflectance may exceed 1."""
+OUTLIER = 20.0
+"""A reflectance that is so many times the 95 % quantile says nothing about the scale."""
+FEWEST_POINTS = 10
+"""From so many points on a reflectance that is the same everywhere means nothing."""
+
+LEFT_OUT = "reflectance left out"
+
+NEAREST, NEAR, FAR = 3.0, 15.0, 50.0
+"""Metres from the sensor: the ground is looked for between the first two, and up to the third where few points are."""
+CELL = 1.0  # metres
+WINDOW = 0.6
+"""Metres of height that hold the lowest points of most cells of a street."""
+FEWEST_CELLS = 30
+GROUND_SHARE = 0.3
+"""Share of the cells whose lowest points must agree; in KITTI's frames it is 0.55 and more."""
+GROUND_TOLERANCE = 0.4
+"""Metres by which the ground may differ from that of the training data before a cloud is moved; KITTI's own frames
+differ by 0.25 at most."""
+SAMPLED = 40_000
+"""Points that are looked at: more of them tell the same."""
+FEW_IN_RANGE = 0.02
+"""Share of a cloud's points in range below which the reason is wanted: it is 0.2 of KITTI's whole scans."""
+HIGHEST = 500.0  # metres; ground further above or below the sensor is not found
+
+
+class Reflectance(NamedTuple):
+    """The reflectance of a cloud, and what was found out about it."""
+
+    values: Floats  # (N,) in [0, 1]
+    scale: float  # what it was divided by; 0 if there is none
+    highest: float = 0.0  # before that
+    missing: str = ""  # why there is none
+
+    @property
+    def fact(self) -> str:
+        """What was done, in the same words for all clouds of a sensor."""
+        if not self.scale:
+            return self.missing
+        return "reflectance as is" if self.scale == 1 else f"reflectance / {self.scale:g}"
+
+    @property
+    def note(self) -> str:
+        """What a user should know of all clouds of a sensor; empty if nothing was done but what was asked for."""
+        if not self.scale:
+            return "" if self.missing == LEFT_OUT else f"has {self.missing}; 0 is used, which makes detection worse"
+        return "" if self.scale == 1 else f"reflectance was divided by {self.scale:g}"
+
+
+def highest_reflectance(values: NDArray) -> float:
+    """The 99 % quantile of reflectances (N,), outliers left out: what tells the scale. 0 if there is none."""
+    values = values[np.isfinite(values) & (values > 0)].astype(np.float64)
+    if not len(values):
+        return 0.0
+    values = values[values / OUTLIER <= np.quantile(values, 0.95)]
+    return float(np.quantile(values, 0.99, method="higher"))
+
+
+def full_scale(highest: float) -> float:
+    """The scale of reflectances up to `highest`: 1, 255, 65535 or, beyond that, the highest itself."""
+    return next((full for full in FULL_SCALES if highest <= full + TOLERANCE * (full == 1)), highest)
+
+
+def has_reflectance(values: NDArray) -> bool:
+    """Whether reflectances (N,) mean anything: they are not all the same."""
+    finite = values[np.isfinite(values)]
+    return len(values) == 0 or (len(finite) > 0 and (len(finite) < FEWEST_POINTS or finite.min() < finite.max()))
+
+
+def judge_reflectance(values: NDArray | None, count: int, scale: float) -> Reflectance:
+    """The reflectance (N,) of `count` points as a detector takes it: divided by the scale, outliers clipped.
+
+    0 where it is NaN, and everywhere if there is none, if it is the same everywhere, or if the scale is 0.
+    """
+    if values is None or scale == 0 or not has_reflectance(values):
+        missing = "no reflectance" if values is None else LEFT_OUT if scale == 0 else "a constant reflectance"
+        return Reflectance(np.zeros(count, np.float32), 0.0, missing=missing)
+    with np.errstate(all="ignore"):
+        highest = float(values.max(initial=0, where=np.isfinite(values)))
+        scaled = values if scale == 1 else (values / np.float32(scale)).astype(np.float32)
+        if not (scaled.min(initial=0) >= 0 and scaled.max(initial=0) <= 1):  # nearly never: spares the copy
+            scaled = np.nan_to_num(scaled, nan=0.0).clip(0, 1)
+    return Reflectance(scaled.astype(np.float32, copy=False), scale, highest)
+
+
+def dropped_note(count: int) -> str:
+    """What to say of points that were dropped."""
+    return f"{count} points that are not finite were dropped"
+
+
+def as_points(points: object, device: torch.device | str = "cpu") -> Tensor:
+    """Points of any array as a float32 tensor (N, 4) on a device: x, y, z in metres, reflectance in [0, 1].
+
+    A reflectance that is NaN, or the same everywhere, is 0: there is none. Raises ValueError for another shape, or
+    numbers that are not real.
+    """
+    if isinstance(points, np.ndarray):
+        if points.dtype.kind not in "fiu":
+            raise ValueError(f"points: want real numbers, got {points.dtype}")
+        # torch takes neither a foreign byte order nor a negative stride, and warns of read-only memory
+        with np.errstate(over="ignore"):
+            points = np.require(points, np.float32, ["C", "W"])
+    if isinstance(points, Tensor) and points.is_complex():
+        raise ValueError(f"points: want real numbers, got {points.dtype}")
+    tensor = torch.as_tensor(points, dtype=torch.float32, device=device)
+    if tensor.ndim != 2 or tensor.shape[1] != 4:
+        hint = ": it is transposed, give points.T" if tensor.ndim == 2 and tensor.shape[0] == 4 else ""
+        raise ValueError(f"points: want shape (N, 4) with x, y, z, reflectance, got {tuple(tensor.shape)}{hint}")
+    reflectance = tensor[:, 3]
+    clean = reflectance.nan_to_num(0.0, math.inf, -math.inf).clamp(min=0)
+    if len(tensor) >= FEWEST_POINTS:
+        clean = clean.where(clean.amin() < clean.amax(), 0.0)
+    if tensor.device.type == "cpu" and torch.equal(clean, reflectance):
+        return tensor
+    return torch.cat((tensor[:, :3], clean[:, None]), dim=1)
+
+
+def inside(points: Tensor, point_range: Sequence[float]) -> Tensor:
+    """Which of the points (N, 3 or more) are in the range x_min, y_min, z_min, x_max, y_max, z_max: (N,) bool."""
+    x, y, z = points[:, 0], points[:, 1], points[:, 2]
+    x_min, y_min, z_min, x_max, y_max, z_max = point_range
+    return (x >= x_min) & (x < x_max) & (y >= y_min) & (y < y_max) & (z >= z_min) & (z < z_max)
+
+
+def too_bright(points: Tensor, point_range: Sequence[float]) -> Tensor:
+    """The largest reflectance of the points (N, 4) in range if it is more than a tolerance above 1, else 0: ()."""
+    if not len(points):
+        return points.new_zeros(())
+    bright = points[:, 3] > 1 + TOLERANCE
+    if points.device.type == "cpu" and not bright.any():  # nearly always
+        return points.new_zeros(())
+    return points[:, 3].where(bright & inside(points, point_range), 0.0).amax()
+
+
+def reflectance_error(largest: float) -> str:
+    """What to say of reflectances up to `largest` in an array."""
+    return f"points: want a reflectance from 0 to 1, got {largest:g}; divide column 4 by its scale, such as 255"
+
+
+def ground_height(points: Tensor) -> Tensor:
+    """Height in metres of the ground around the sensor in a cloud (N, 3 or more): (), NaN where none is found.
+
+    In every cell of 1 m the lowest twentieth of the points is skipped; the ground is where most cells agree on the next
+    one. No length depends on the data, so that nothing is read from a GPU.
+    """
+    points = points[:: max(1, len(points) // SAMPLED), :3]
+    height, enough = _common_height(_low_heights(points, NEAR))
+    if points.device.type == "cuda" or not enough:
+        wide, enough_wide = _common_height(_low_heights(points, FAR))
+        height = height.where(enough, wide.where(enough_wide, math.nan))
+    return height.to(points.dtype)
+
+
+def _low_heights(points: Tensor, far: float) -> Tensor:
+    """The low points' height in metres in every cell (C,) up to a distance from the sensor; infinite in empty cells."""
+    x, y, z = points.unbind(1)
+    distance = torch.hypot(x, y)
+    ring = (distance >= NEAREST) & (distance < far) & (z.abs() < HIGHEST)  # false for NaN
+    if points.device.type == "cpu":
+        x, y, z, ring = x[ring], y[ring], z[ring], ring[ring]
+    side = math.ceil(2 * far / CELL)
+    cell = ((x + far) / CELL).int().clamp(0, side - 1) * side + ((y + far) / CELL).int().clamp(0, side - 1)
+    # cell and height, to the centimetre, in one number, which is sorted once
+    levels = 2**17
+    key = torch.where(ring, cell * levels + ((z + HIGHEST) * 100).int(), side * side * levels).sort().values
+    starts = torch.searchsorted(key, torch.arange(side * side + 1, device=points.device, dtype=torch.int32) * levels)
+    counts = starts.diff()
+    if not len(key):
+        return points.new_full((1,), math.inf)
+    low = key[(starts[:-1] + counts // 20).clamp(max=len(key) - 1)] % levels
+    return torch.where(counts > 0, low / 100 - HIGHEST, math.inf)
+
+
+def _common_height(low: Tensor) -> tuple[Tensor, Tensor]:
+    """The height () that most of the heights (C,) are near, infinite ones left out, and whether they are enough."""
+    low = low.sort().values
+    total = low.isfinite().sum()
+    last = torch.searchsorted(low, low + WINDOW, right=True)
+    counts = (last.minimum(total) - torch.arange(len(low), device=low.device)).clamp(min=0)
+    best = counts.argmax()
+    enough = (total >= FEWEST_CELLS) & (counts[best] >= GROUND_SHARE * total)
+    return low[best + counts[best] // 2], enough
+
+
+def shift_to(ground: Tensor, wanted: float) -> Tensor:
+    """By how many metres () a cloud has to be raised, so that its ground lies where it is wanted; 0 if it nearly does,
+    or is not known."""
+    shift = wanted - ground
+    return shift.where(shift.abs() > GROUND_TOLERANCE, 0.0)
+
+
+class Look(NamedTuple):
+    """What a detector sees of a cloud."""
+
+    points: int
+    in_range: int
+    ground: float  # height in metres, NaN where none is found
+    shift: float  # metres by which the cloud was raised
+    reason: str = ""  # why few or none of the points are in range
+
+    def text(self) -> str:
+        """In a few words."""
+        ground = "no ground found" if math.isnan(self.ground) else f"ground at {self.ground:.2f} m"
+        moved = f", moved to {self.ground + self.shift:.2f} m" if self.shift else ""
+        return f"{self.points:,} points, {self.in_range:,} in range; {ground}{moved}"
+
+
+def summary(looks: Sequence[Look], reflectances: Sequence[str]) -> str:
+    """What was seen of all clouds of a call, and what was done to their reflectances, in one line."""
+    points = [look.points for look in looks]
+    shares = [100 * look.in_range / max(look.points, 1) for look in looks]
+    grounds = [look.ground for look in looks if not math.isnan(look.ground)]
+    parts = [f"{_span(points, '{:,.0f}')} points", f"{_span(shares, '{:.0f}')} % in range"]
+    parts.append(f"ground {_span(grounds, '{:.2f}')} m" if grounds else "no ground found")
+    moved = [look.shift for look in looks if look.shift]
+    if moved:
+        parts.append(f"{len(moved)} of {len(looks)} moved by {_span(moved, '{:+.2f}')} m")
+    return ", ".join(parts + sorted(set(reflectances)))
+
+
+def _span(values: Sequence[float], form: str) -> str:
+    low, high = form.format(min(values)), form.format(max(values))
+    return low if low == high else f"{low} to {high}"
+
+
+def range_reason(points: Tensor, point_range: Sequence[float]) -> str:
+    """Why few or none of the points (N, 4) are in range, with the remedy."""
+    finite = points[:, :3][points[:, :3].isfinite().all(dim=1)].double()
+    if not len(finite):
+        return "the cloud has no points"
+    middle = finite.median(dim=0).values
+    distance, size = float(middle[:2].norm()), float((finite[:, :2] - middle[:2]).norm(dim=1).median())
+    reach = max(abs(value) for value in point_range)
+    if distance > max(3 * size, 2 * reach):
+        where = ", ".join(f"{value:.0f}" for value in middle)
+        return f"they lie around {where}, as map coordinates do; subtract the sensor's position"
+    if size > 5 * reach:
+        unit = "millimetres" if size > 50 * reach else "centimetres"
+        return f"half of them are further than {size:,.0f} from the sensor, as in {unit}; metres are wanted"
+    low, high = (float(value) for value in finite[:, 2].quantile(finite.new_tensor([0.05, 0.95])))
+    if high < point_range[2] or low >= point_range[5]:
+        return f"their heights are {low:.1f} to {high:.1f} m; give --sensor-height"
+    return "they lie behind or beside the sensor; --turn or --all-round shows the detector that side"
