@@ -2,13 +2,14 @@
 
 import math
 
+import pytest
 import torch
 from torch import Tensor
 
 from hvnet.boxes import bev_corners
 from hvnet.config import Config
 from hvnet.kernels import reference
-from hvnet.network.anchors import assign_targets, decode, encode, make_anchors
+from hvnet.network.anchors import MAX_HEIGHT, MAX_SHIFT, MAX_SIZE, assign_targets, decode, encode, make_anchors
 
 
 def any_boxes(count: int, seed: int = 0) -> Tensor:
@@ -65,6 +66,78 @@ def test_encode_by_hand() -> None:
     torch.testing.assert_close(vertical, torch.tensor([[0.2, math.log(2)]]))
     assert direction.tolist() == [1]
     assert bev_corners(anchor)[0].tolist() == [[12, 1], [12, -1], [8, -1], [8, 1]]
+
+
+HUGE = [100.0, 1e4, 1e30, 3.4e38, math.inf]
+
+
+@pytest.mark.parametrize("values", [8, 5])
+@pytest.mark.parametrize("value", [*HUGE, *(-each for each in HUGE)])
+def test_decoded_boxes_are_bounded(values: int, value: float, device: torch.device) -> None:
+    """Every output huge, and one output at a time with the others 0; the gradient is finite, too."""
+    anchors = any_boxes(values + 3).to(device)
+    outputs = torch.zeros(values + 3, values + 2, device=device)
+    outputs[0] = value
+    outputs[1:].fill_diagonal_(value)
+    outputs.requires_grad_()
+    boxes = decode(outputs[:, :values], outputs[:, values:], None, anchors)
+    assert boxes.isfinite().all()
+    assert ((boxes[:, 3:5] >= 0) & (boxes[:, 3:5] <= MAX_SIZE)).all()
+    assert ((boxes[:, 5] >= 0) & (boxes[:, 5] <= MAX_HEIGHT)).all()
+    assert ((boxes[:, 2] - anchors[:, 2]).abs() <= MAX_HEIGHT + 1e-5).all()
+    assert ((boxes[:, :2] - anchors[:, :2]).abs() <= MAX_SHIFT + 1e-4).all()
+    assert ((boxes[:, 6] >= -math.pi) & (boxes[:, 6] < math.pi)).all()
+    boxes.sum().backward()
+    assert outputs.grad is not None
+    assert outputs.grad.isfinite().all()
+
+
+def test_bounds_by_hand() -> None:
+    """At a bound, beyond it, and with an anchor that is larger than the bounds."""
+    small, large = [0.0, 0, 0, 4, 2, 2, 0], [0.0, 0, 0, 50, 3, 12, 0]
+    anchors = torch.tensor([small, small, large, large])
+    sizes = torch.tensor([[39, 3, 9], [41, 41, 11], [50, 90, 12], [110, 3, 25.0]])
+    vertical = torch.stack((torch.tensor([4.9, 6, 1, -3]), (sizes[:, 2] / anchors[:, 5]).log()), dim=1)
+    want = torch.tensor([[9.8, 39, 3, 9], [10, 40, 40, 10], [12, 50, 90, 12], [-24, 100, 3, 24]])
+    boxes = torch.cat((torch.zeros(4, 3), sizes, torch.zeros(4, 1)), dim=1)
+    for regression in ("corners", "pose"):
+        location, _, _ = encode(boxes, anchors, regression)
+        torch.testing.assert_close(decode(location, vertical, None, anchors)[:, 2:6], want, rtol=1e-5, atol=1e-5)
+    location = torch.tensor([[120.0, -99] * 4, [-70, 101] * 4, [0, 0] * 4, [0, 0] * 4])
+    centres = decode(location, vertical, None, anchors)[:, :2]
+    assert centres.tolist() == [[100, -99], [-70, 100], [0, 0], [0, 0]]
+
+
+@pytest.mark.parametrize("values", [8, 5])
+def test_inside_the_bounds_nothing_is_changed(
+    values: int, device: torch.device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same bits and the same gradients as without bounds."""
+    generator = torch.Generator().manual_seed(values)
+    anchors, weight = any_boxes(3000).to(device), torch.randn(7, generator=generator).to(device)
+    outputs = (torch.randn(3000, values + 2, generator=generator) * 0.5).to(device).requires_grad_()
+
+    def boxes_and_gradient() -> tuple[Tensor, Tensor]:
+        boxes = decode(outputs[:, :values], outputs[:, values:], None, anchors)
+        return boxes, torch.autograd.grad((boxes * weight).sum(), outputs)[0]
+
+    found = boxes_and_gradient()
+    for name in ("MAX_SIZE", "MAX_HEIGHT", "MAX_SHIFT", "MAX_OUTPUT"):
+        monkeypatch.setattr(f"hvnet.network.anchors.{name}", math.inf)
+    want = boxes_and_gradient()
+    inside = (want[0][:, 3:5].amax(dim=1) < MAX_SIZE) & (want[0][:, 5] < MAX_HEIGHT)
+    assert inside.float().mean() > 0.99
+    assert torch.equal(found[0][inside], want[0][inside])
+    assert torch.equal(found[1][inside], want[1][inside])
+
+
+@pytest.mark.parametrize("values", [8, 5])
+def test_a_nan_stays_one(values: int) -> None:
+    """Any output that is NaN makes a box that is not finite."""
+    outputs = torch.zeros(values + 2, values + 2).fill_diagonal_(math.nan)
+    boxes = decode(outputs[:, :values], outputs[:, values:], None, any_boxes(values + 2))
+    assert boxes.isnan().any(dim=1).all()
+    assert decode(outputs[:0, :values], outputs[:0, values:], None, any_boxes(0)).shape == (0, 7)
 
 
 def test_assign_targets_by_hand() -> None:

@@ -1,9 +1,11 @@
 """Inference: every stage against the plain model, clouds of any kind, checkpoints, and the shipped weights."""
 
+import copy
 import dataclasses
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -12,8 +14,17 @@ from hvnet.config import ClassConfig, Config, config_to_dict, load_config
 from hvnet.data.kitti import read_frame
 from hvnet.exceptions import InputError
 from hvnet.kernels.rotated import rotated_iou_bev
+from hvnet.network.anchors import MAX_HEIGHT, MAX_SIZE
 from hvnet.network.checkpoint import save_checkpoint
-from hvnet.network.detector import Detector, fold_batch_norms, load, regress, regression_weight
+from hvnet.network.detector import (
+    Detector,
+    fold_batch_norms,
+    load,
+    regress,
+    regression_weight,
+    turned,
+    turns_all_round,
+)
 from hvnet.network.head import Head
 from hvnet.network.model import Detections, HVNet
 from tests.models import CONFIGS, NARROW, lively, some_points
@@ -131,6 +142,67 @@ def test_training_does_not_change_a_detector(demo: Config) -> None:
         assert torch.equal(now, then)
 
 
+def on_a_gpu(detector: Detector, points: Tensor) -> Detections:
+    """What a detector on the CPU finds by the steps that it takes on a GPU."""
+    with torch.no_grad():
+        levels, scores = detector.maps(points, torch.zeros(len(points), dtype=torch.int64), 1)
+        detector.device = torch.device("cuda")
+        found = detector.suppress(detector.candidates(levels, scores))[0]
+        detector.device = CPU
+    return found
+
+
+@pytest.mark.parametrize("branch", ["location", "vertical"])
+@pytest.mark.parametrize("value", [1e30, -1e30, math.inf, -math.inf])
+@pytest.mark.parametrize("regression", ["corners", "pose"])
+def test_boxes_of_outputs_without_bounds(demo: Config, regression: str, value: float, branch: str) -> None:
+    """A head that has gone astray gives boxes that a street can hold."""
+    model = lively(demo, regression=regression, score_threshold=0.02)
+    for head in model.heads:
+        torch.nn.init.constant_(getattr(head, branch).bias, value)
+    points, detector = some_points(), Detector(model, CPU, torch.float32)
+    plain = model.detect(points, torch.zeros(500, dtype=torch.int64), 1)[0]
+    for found in (plain, detector(points), on_a_gpu(detector, points)):
+        assert set(found.labels.tolist()) == {0, 1, 2}
+        assert found.boxes.isfinite().all()
+        assert (found.boxes[:, 3:5] <= MAX_SIZE).all()
+        assert (found.boxes[:, 5] <= MAX_HEIGHT).all()
+
+
+@pytest.mark.parametrize("branch", ["score", "location", "vertical"])
+@pytest.mark.parametrize("regression", ["corners", "pose"])
+def test_what_is_not_a_number_is_not_reported(demo: Config, regression: str, branch: str) -> None:
+    """The anchors of one orientation give NaN: the others are reported as if those did not exist."""
+    model = lively(demo, regression=regression, score_threshold=0.02, candidates=30)
+    without = copy.deepcopy(model)
+    for head, other in zip(model.heads, without.heads, strict=True):
+        bias = getattr(head, branch).bias
+        torch.nn.init.constant_(bias[: len(bias) // 4], math.nan)
+        if branch == "score":
+            torch.nn.init.constant_(other.score.bias[:1], -100.0)
+    points, sample = some_points(), torch.zeros(500, dtype=torch.int64)
+    detector = Detector(model, CPU, torch.float32)
+    plain = model.detect(points, sample, 1)[0]
+    for found in (plain, detector(points), on_a_gpu(detector, points)):
+        assert len(found.boxes) > 5
+        assert found.boxes.isfinite().all()
+        assert found.scores.isfinite().all()
+        same(found, plain)
+    if branch == "score":
+        same(plain, without.detect(points, sample, 1)[0])
+
+
+@pytest.mark.parametrize("branch", ["score", "location", "vertical"])
+def test_nothing_but_nan(demo: Config, branch: str) -> None:
+    model = lively(demo, score_threshold=0.02)
+    for head in model.heads:
+        torch.nn.init.constant_(getattr(head, branch).bias, math.nan)
+    points, detector = some_points(), Detector(model, CPU, torch.float32)
+    plain = model.detect(points, torch.zeros(500, dtype=torch.int64), 1)[0]
+    for found in (plain, detector(points), on_a_gpu(detector, points)):
+        assert found.boxes.shape == (0, 7)
+
+
 @pytest.mark.cuda
 def test_the_graph_gives_the_same_boxes(demo: Config, device: torch.device) -> None:
     if device.type != "cuda":
@@ -197,3 +269,142 @@ def test_bad_checkpoints(demo: Config, tmp_path: Path) -> None:
     torch.save({"config": config_to_dict(demo), "model": ClassConfig}, path)
     with pytest.raises(InputError, match="truncated, or no checkpoint"):
         load(path)
+
+
+# --- clouds of other sensors -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def street(kitti_root: Path) -> Tensor:
+    """What KITTI's camera sees of a real frame."""
+    return read_frame(kitti_root, "000008").points
+
+
+def agree(found: Detections, want: Detections) -> None:
+    """The same boxes, but for the rounding of coordinates that were moved or turned."""
+    sure = want.select(want.scores > 0.3)
+    iou = rotated_iou_bev(sure.boxes, found.boxes)
+    best, which = iou.max(dim=1)
+    assert len(sure.boxes) >= 5
+    assert (best > 0.9).float().mean() > 0.8
+    close = best > 0.9
+    torch.testing.assert_close(found.boxes[which][close][:, 2], sure.boxes[close][:, 2], rtol=0, atol=0.1)
+    turn = (found.boxes[which][close][:, 6] - sure.boxes[close][:, 6]).cos()
+    assert turn.abs().min() > 0.99
+    assert (turn > 0).float().mean() > 0.9  # a heading that is nearly a tie may be the other one
+
+
+@pytest.mark.parametrize("height", [-5.0, 1.33, 4.0, 60.0])
+def test_a_cloud_at_another_height_is_moved_and_its_boxes_are_moved_back(street: Tensor, height: float) -> None:
+    moved = street + torch.tensor([0, 0, height, 0])
+    want = load(device="cpu")(street)
+    want = want._replace(boxes=want.boxes + torch.tensor([0, 0, height, 0, 0, 0, 0]))
+    agree(load(device="cpu")(moved), want)
+    if -height + 1.66 >= 0:
+        agree(load(device="cpu", sensor_height=1.66 - height)(moved), want)
+    left = load(device="cpu", sensor_height="none")(moved)
+    assert len(left.select(left.scores > 0.3).boxes) < len(want.select(want.scores > 0.3).boxes) / 2
+
+
+def test_a_cloud_at_the_usual_height_is_left_alone(street: Tensor) -> None:
+    want = load(device="cpu", sensor_height="none")(street)
+    for found in (load(device="cpu")(street), load(device="cpu", sensor_height=1.73)(street)):
+        for column, wanted in zip(found, want, strict=True):
+            assert torch.equal(column, wanted)
+    detector = load(device="cpu")
+    look = detector.look(street)
+    assert (look.points, look.shift, look.reason) == (len(street), 0.0, "")
+    assert look.ground == pytest.approx(-1.66, abs=0.1)
+    assert detector.look(street + torch.tensor([0, 0, 1.33, 0])).shift == pytest.approx(-1.33, abs=0.1)
+
+
+@pytest.mark.parametrize("degrees", [-90.0, 37.0, 180.0])
+def test_a_turned_cloud(street: Tensor, degrees: float) -> None:
+    """A sensor whose forward is elsewhere: `turn` brings it to x."""
+    mounted = turned(street, math.radians(-degrees))
+    want = load(device="cpu")(street)
+    boxes = turned(want.boxes, math.radians(-degrees))
+    boxes[:, 6] -= math.radians(degrees)
+    agree(load(device="cpu", turn=degrees)(mounted), want._replace(boxes=boxes))
+
+
+def test_all_round(street: Tensor) -> None:
+    """What is behind is found as well as what is in front, each object once, the best of a class first."""
+    both = torch.cat((street, turned(street, math.pi)))
+    want = load(device="cpu")(street)
+    detector = load(device="cpu", all_round=True)
+    assert len(detector.turns) == 4
+    found = detector(both)
+    agree(found, want)
+    behind = turned(want.boxes, math.pi)
+    behind[:, 6] += math.pi
+    agree(found, want._replace(boxes=behind))
+    for label in range(3):
+        own = found.select(found.labels == label)
+        assert (own.scores.diff() <= 0).all()
+        iou = rotated_iou_bev(own.boxes, own.boxes).fill_diagonal_(0)
+        assert iou.max() <= detector.entries[label].nms_iou + 1e-6
+        assert len(own.boxes) <= detector.config.head.detections
+    assert (found.labels.diff() >= 0).all()
+    assert detector.look(both).in_range > 1.8 * load(device="cpu").look(both).in_range
+
+
+def test_clouds_at_different_heights_together(street: Tensor) -> None:
+    """As if each were alone."""
+    clouds = [street, street + torch.tensor([0, 0, 1.33, 0]), turned(street, math.pi)]
+    for options in ({}, {"all_round": True, "turn": 10.0}):
+        detector = load(device="cpu", **options)  # type: ignore[arg-type]
+        for found, cloud in zip(detector.batch(clouds), clouds, strict=True):
+            same(found, detector(cloud), 1e-3)
+
+
+@pytest.mark.parametrize(("point_range", "turns"), [
+    ((0, -32, -3, 64, 32, 2), 4),
+    ((0, -40, -3, 70.4, 40, 1), 4),
+    ((0, -64, -3, 64, 64, 2), 2),
+    ((0, -10, -3, 64, 10, 2), 14),
+    ((-38.4, -38.4, -3, 38.4, 38.4, 2), 1),
+    ((-64, -32, -3, 64, 32, 2), 4),
+])  # fmt: skip
+def test_turns_all_round(point_range: tuple[float, ...], turns: int) -> None:
+    assert turns_all_round(point_range) == turns
+    reach = 2 / 3 * point_range[3]
+    assert turns == 1 or reach * math.sin(math.pi / turns) <= point_range[4]
+
+
+def test_a_range_beside_the_sensor_cannot_look_all_round() -> None:
+    with pytest.raises(InputError, match=r"point_range \[0, 1, -3, 64, 32, 2\]: is not around the x axis"):
+        turns_all_round((0, 1, -3, 64, 32, 2))
+
+
+def test_a_model_trained_without_reflectance_gets_none(demo: Config) -> None:
+    model = lively(demo, score_threshold=0.02)
+    points = some_points(400)
+    dark = points.clone()
+    dark[:, 3] = 0
+    same(
+        Detector(model, CPU, torch.float32, reflectance=False)(points), Detector(model, CPU, torch.float32)(dark), 1e-6
+    )
+
+
+def test_without_the_ground_of_the_training_data_nothing_is_moved(demo: Config, street: Tensor) -> None:
+    """A checkpoint of an earlier version does not know it."""
+    detector = Detector(lively(demo), CPU)
+    assert detector.look(street + torch.tensor([0, 0, 1.33, 0])).shift == 0
+
+
+def test_points_of_any_array(demo: Config) -> None:
+    detector = Detector(lively(demo, score_threshold=0.02), CPU, torch.float32)
+    points = some_points(400)
+    want = detector(points)
+    array = points.numpy()
+    locked = array.copy()
+    locked.flags.writeable = False
+    for each in (array.astype(">f8"), array[::-1].copy()[::-1], locked, np.asfortranarray(array)):
+        same(detector(each), want, 1e-6)
+    with pytest.raises(ValueError, match="it is transposed"):
+        detector(array.T)
+    bright = points.clone()
+    bright[:, 3] *= 255
+    with pytest.raises(ValueError, match=r"want a reflectance from 0 to 1, got 2\d\d"):
+        detector(bright)

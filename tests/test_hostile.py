@@ -1,12 +1,16 @@
 """A thousand hostile files: each gives a result or one clear error, and no memory grows.
 
 Clouds, labels, calibrations, configs and checkpoints of random bytes, and good ones that were cut, flipped or filled
-with impossible values; from nothing to 64 MB. An error is an InputError that names the file; anything else fails.
+with impossible values; from nothing to 64 MB. An error is an InputError that names the file; anything else fails, a
+warning of numpy or torch too: it would be written to a user's terminal.
 """
 
+import contextlib
 import io
 import time
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +25,7 @@ from hvnet.exceptions import InputError
 from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint, save_checkpoint
 from hvnet.network.detector import Detector, load
 from hvnet.network.model import HVNet
-from tests.helpers import ROOT
+from tests.helpers import CAMERA, ROOT
 
 NARROW = ["encoder.point_range=[0, -3.2, -3, 12.8, 3.2, 2]", "head.score_threshold=0.0", "head.candidates=50"]
 SECONDS = 10.0  # that any one of them may take
@@ -140,6 +144,14 @@ def resident() -> float:
     return pages * 4096 / 2**20
 
 
+@contextlib.contextmanager
+def warnings_as_errors() -> Iterator[None]:
+    with warnings.catch_warnings():
+        for category in (RuntimeWarning, UserWarning):
+            warnings.simplefilter("error", category)
+        yield
+
+
 def test_a_thousand_hostile_files(tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
     torch.manual_seed(0)
@@ -177,7 +189,8 @@ def test_a_thousand_hostile_files(tmp_path: Path) -> None:
         path.write_bytes(content)
         begin = time.perf_counter()
         try:
-            take(path)
+            with warnings_as_errors():
+                take(path)
             said = ""
         except InputError as error:
             said = str(error)
@@ -215,7 +228,8 @@ def test_hostile_frames_through_the_command(tmp_path: Path, capsys: pytest.Captu
             path.write_bytes(content)
         options = ["--checkpoint", str(checkpoint), "--out", str(root / "out"), "--pictures", "1", "--device", "cpu"]
         try:
-            main([str(root), *options])
+            with warnings_as_errors():
+                main([str(root), *options])
             outcome = "result"
         except InputError as error:
             outcome, said = "error", str(error)
@@ -231,6 +245,44 @@ def test_hostile_frames_through_the_command(tmp_path: Path, capsys: pytest.Captu
     torch.zeros(0, 4),
 ])  # fmt: skip
 def test_the_shipped_detector_takes_any_cloud(points: torch.Tensor) -> None:
-    found = load(device="cpu")(points)
+    with warnings_as_errors():
+        found = load(device="cpu")(points)
     assert found.boxes.isfinite().all()
     assert found.scores.isfinite().all()
+
+
+HUGE = (0.0, 1.0, -1e30, 3e38, 1e160, 1e308, -1e308, np.inf, -np.inf, np.nan)
+
+
+def test_a_camera_of_hostile_numbers() -> None:
+    """Points, boxes, lines and polygons of any numbers, seen by cameras of any numbers: what is visible is finite."""
+    generator = np.random.default_rng(0)
+    inside = np.array([[10.0, 0, 0], [20.0, 1, 1], [15.0, -1, 0]])
+    for k in range(500):
+        points, boxes = generator.normal(10, 5, (200, 3)), np.tile([10.0, 0, 0, 4, 2, 2, 0], (20, 1))
+        points[generator.random(points.shape) < 0.2] = generator.choice(HUGE)
+        boxes[generator.random(boxes.shape) < 0.2] = generator.choice(HUGE)
+        matrices = {"p2": CAMERA.p2.copy(), "velo_to_cam": CAMERA.velo_to_cam.copy()}
+        for matrix in matrices.values():
+            matrix[generator.random(matrix.shape) < 0.1] = generator.choice(HUGE)
+        camera = replace(CAMERA, **matrices) if k % 2 else CAMERA
+        with warnings_as_errors():
+            camera.to_camera(points)
+            seen, (pixels, depth) = camera.sees(points), camera.project(points)
+            bbox, visible = camera.project_boxes(boxes)
+            lines, drawn = camera.project_lines(points[:100], points[100:])
+            polygons = [camera.project_polygon(corners) for corners in points.reshape(-1, 4, 3)]
+        assert np.isfinite(pixels[seen]).all()
+        assert np.isfinite(depth[seen]).all()
+        assert np.isfinite(bbox).all()
+        assert (bbox[~visible] == 0).all()
+        assert np.isfinite(lines).all()
+        assert len(lines) == drawn.sum()
+        assert np.isfinite(np.concatenate(polygons)).all()
+        if camera is CAMERA:
+            assert camera.sees(inside).all()
+            finite = np.isfinite(points).all(axis=1)
+            with warnings_as_errors():
+                there = camera.to_lidar(camera.to_camera(points))
+            near = finite & (np.abs(points) < 1e3).all(axis=1)
+            np.testing.assert_allclose(there[near], points[near], atol=1e-9)

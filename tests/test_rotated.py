@@ -441,6 +441,23 @@ def test_negative_size_of_many(device: torch.device) -> None:
                 rotated.nms_order(bad, scores, 0.5)
 
 
+def test_a_nan_score_is_not_kept_and_suppresses_nothing(device: torch.device) -> None:
+    """Of boxes that are all the same, in every way that there is to suppress them."""
+    boxes, flat = box(0, 0, 4, 2).repeat(4, 1).float().to(device), torch.ones(4, 5, device=device)
+    scores, group = torch.tensor([math.nan, 0.2, math.nan, 0.4], device=device), torch.zeros(4, dtype=torch.int64)
+    order, keep = rotated.nms_order(boxes, scores, 0.5)
+    for kept in (
+        rotated.rotated_nms(boxes, scores, 0.5),
+        order[keep],
+        rotated.nms_rotated(flat, scores, 0.5),
+        rotated.batched_nms_rotated(flat, scores, group.to(device), 0.5),
+    ):
+        assert kept.tolist() == [3]
+    boxes[3], flat[3] = math.nan, math.nan  # nor does a box that is not a number
+    assert rotated.rotated_nms(boxes, scores, 0.5).tolist() == [3, 1]
+    assert rotated.nms_rotated(flat, scores, 0.5).tolist() == [3, 1]
+
+
 def test_nms_order_has_fixed_sizes(device: torch.device) -> None:
     boxes = random_boxes(50, 22, spread=6).to(device)
     scores = torch.rand(50, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).to(device)
@@ -589,8 +606,12 @@ def test_bad_image_boxes() -> None:
         rotated.box_iou_rotated(boxes.long(), boxes)
     with pytest.raises(ValueError, match=r"\ba\b.*-1"):
         rotated.box_iou_rotated(-boxes, boxes)
+    with pytest.raises(ValueError, match=r"\bb\b.*-1"):
+        rotated.box_iou_rotated(boxes, -boxes)
     with pytest.raises(ValueError, match=r"boxes.*-1"):
         rotated.nms_rotated(-boxes, scores, 0.5)
+    with pytest.raises(ValueError, match=r"boxes.*-1"):
+        rotated.batched_nms_rotated(-boxes, scores, idxs, 0.5)
     with pytest.raises(ValueError, match=r"scores.*2"):
         rotated.nms_rotated(boxes, scores[:2], 0.5)
     with pytest.raises(TypeError, match=r"idxs.*float32"):

@@ -19,7 +19,8 @@ from hvnet.weights.__main__ import CONFIG, RECIPE, halve, main
 def test_the_shipped_weights() -> None:
     assert SHIPPED.stat().st_size <= 10e6
     content = load_checkpoint(SHIPPED)
-    assert content.keys() == {"config", "model"}
+    assert content.keys() == {"config", "model", "sensor"}
+    assert content["sensor"] == {"ground": pytest.approx(-1.66, abs=0.05), "reflectance_scale": 1.0}
     recipe = load_config(CONFIG, RECIPE)
     assert config_from_dict(content["config"], str(SHIPPED)) == recipe
     for name, value in content["model"].items():

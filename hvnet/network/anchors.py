@@ -13,6 +13,18 @@ from hvnet.network.grids import projection_grids, pyramid_depth
 
 ORIENTATIONS = (0.0, math.pi / 4, math.pi / 2, 3 * math.pi / 4)
 
+MAX_SIZE = 40.0
+"""Metres that a decoded length or width has at most, or twice the anchor's longer side if that is more.
+
+An articulated bus is 20 m long.
+"""
+MAX_HEIGHT = 10.0
+"""Metres that a decoded height has at most, or twice the anchor's if that is more; so far is it raised or lowered."""
+MAX_SHIFT = 100.0
+"""Metres along x and y that a decoded centre, or corner, is from the anchor's at most."""
+MAX_OUTPUT = 50.0
+"""Bound of the outputs that are logarithms or radians: exp(50) is finite."""
+
 
 class Targets(NamedTuple):
     """Targets of the anchors of one class over a batch; P of them are positive, in the order of nonzero()."""
@@ -82,25 +94,33 @@ def decode(location: Tensor, vertical: Tensor, direction: Tensor | None, anchors
     """Inverse of `encode`: boxes (P, 7), up to a half-turn if direction, (P,) int64, is None.
 
     Of corners (P, 8) the centre is the mean; the axis is the sum of the edges along the box; length and width are means
-    of opposite edges.
+    of opposite edges. Whatever the outputs, infinite ones too, the box is finite and within MAX_SIZE, MAX_HEIGHT and
+    MAX_SHIFT; only a NaN stays one, so that it is seen.
     """
     if location.shape[1] == 5:
-        centre = anchors[:, :2] + location[:, :2] * anchors[:, 3:5].norm(dim=1, keepdim=True)
-        length, width = (anchors[:, 3:5] * location[:, 2:4].exp()).unbind(1)
-        yaw = anchors[:, 6] + location[:, 4]
+        shift = location[:, :2] * anchors[:, 3:5].norm(dim=1, keepdim=True)
+        centre = anchors[:, :2] + shift.clamp(-MAX_SHIFT, MAX_SHIFT)
+        log_size, turn = location[:, 2:].clamp(-MAX_OUTPUT, MAX_OUTPUT).split((2, 1), dim=1)
+        size, yaw = anchors[:, 3:5] * log_size.exp(), anchors[:, 6:] + turn
     else:
-        front_left, front_right, rear_right, rear_left = (bev_corners(anchors) + location.view(-1, 4, 2)).unbind(1)
+        offsets = location.clamp(-MAX_SHIFT, MAX_SHIFT).view(-1, 4, 2)
+        front_left, front_right, rear_right, rear_left = (bev_corners(anchors) + offsets).unbind(1)
         centre = (front_left + front_right + rear_right + rear_left) / 4
         left, right = front_left - rear_left, front_right - rear_right
         front, rear = front_left - front_right, rear_left - rear_right
         length, width = (left.norm(dim=1) + right.norm(dim=1)) / 2, (front.norm(dim=1) + rear.norm(dim=1)) / 2
+        size = torch.stack((length, width), dim=1)
         axis = left + right
-        yaw = torch.atan2(axis[:, 1], axis[:, 0])
+        yaw = torch.atan2(axis[:, 1:], axis[:, :1])
     if direction is not None:
-        yaw = yaw + math.pi * direction.to(yaw.dtype)
-    height = anchors[:, 5]
-    z, h = anchors[:, 2] + vertical[:, 0] * height, vertical[:, 1].exp() * height
-    return torch.stack((centre[:, 0], centre[:, 1], z, length, width, h, limit_angle(yaw)), dim=1)
+        yaw = yaw + math.pi * direction[:, None].to(yaw.dtype)
+    height = anchors[:, 5:6]
+    largest = (2 * anchors[:, 3:5].amax(dim=1, keepdim=True)).clamp(min=MAX_SIZE)
+    highest = (2 * height).clamp(min=MAX_HEIGHT)
+    z = anchors[:, 2:3] + torch.clamp(vertical[:, :1] * height, -highest, highest)
+    h = vertical[:, 1:].clamp(-MAX_OUTPUT, MAX_OUTPUT).exp() * height
+    sizes = (torch.clamp(size, max=largest), torch.clamp(h, max=highest))
+    return torch.cat((centre, z, *sizes, limit_angle(yaw)), dim=1)
 
 
 def assign_targets(

@@ -6,16 +6,30 @@ everything up to the scores is one CUDA graph, and the boxes come to the host in
 """
 
 import copy
+import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import Literal, NamedTuple, cast
 
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from hvnet.kernels.rotated import nms_order
+from hvnet.boxes import limit_angle
+from hvnet.data.sensor import (
+    FEW_IN_RANGE,
+    Look,
+    as_points,
+    ground_height,
+    inside,
+    range_reason,
+    reflectance_error,
+    shift_to,
+    too_bright,
+)
+from hvnet.exceptions import InputError
+from hvnet.kernels.rotated import nms_order, rotated_nms
 from hvnet.network.anchors import anchors_per_cell, decode
 from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint
 from hvnet.network.devices import select_device
@@ -30,21 +44,55 @@ MAX_GRAPHS = 4
 """CUDA graphs that a detector keeps: each holds the memory of all that it calculates."""
 
 
+SIDEWAYS = 2 / 3
+"""Share of the reach straight ahead that a range must have in a direction for objects to be detected there."""
+
+
+class Placed(NamedTuple):
+    """A cloud as the network sees it, once for every direction in which it looks."""
+
+    clouds: list[Tensor]  # of every direction the points (N, 4), turned so that it is along x
+    shift: Tensor  # () metres by which they were raised
+    ground: Tensor  # () height of the ground before that, NaN where none was found
+    bright: Tensor  # () a reflectance that is too large, 0 if none is
+
+
 class Candidates(NamedTuple):
     """The anchors of a class and a sample that go into NMS; those that are not valid only fill up the array."""
 
     boxes: Tensor  # (K, 7)
     scores: Tensor  # (K,)
-    valid: Tensor  # (K,) bool
+    valid: Tensor  # (K,) bool: above the threshold, and finite
 
 
 class Detector:
     """A trained model on a device: `detector(points)` gives the boxes of one cloud.
 
     The model is copied; training it further does not change the detector.
+
+    ground: height of the road in the clouds that the model was trained with, in metres; None: not known.
+    reflectance: whether these had any.
+    sensor_height: of the sensor above the road in metres, "found" in each cloud by itself, or "none". A cloud whose
+    road lies elsewhere than that of the training data is raised or lowered, and its boxes are moved back.
+    turn: degrees, counter-clockwise, by which a cloud is turned before detection, so that its forward is along x.
+    all_round: look in as many directions as the range's opening needs; each decides what is straight ahead of it.
     """
 
-    def __init__(self, model: HVNet, device: torch.device, dtype: torch.dtype | None = None) -> None:
+    def __init__(
+        self,
+        model: HVNet,
+        device: torch.device,
+        dtype: torch.dtype | None = None,
+        *,
+        ground: float | None = None,
+        reflectance: bool = True,
+        sensor_height: float | Literal["found", "none"] = "found",
+        turn: float = 0.0,
+        all_round: bool = False,
+    ) -> None:
+        self.ground, self.reflectance, self.sensor_height = ground, reflectance, sensor_height
+        turns = 1 if not all_round else turns_all_round(model.config.encoder.point_range)
+        self.turns = [math.radians((turn + 360 * k / turns) % 360) for k in range(turns)]
         self.device = device
         self.dtype = dtype or fastest_dtype(device)
         self.config = model.config
@@ -67,7 +115,8 @@ class Detector:
     def __call__(self, points: Tensor | NDArray) -> Detections:
         """Points (N, 4), x, y, z in metres and reflectance in [0, 1], to boxes (M, 7), scores (M,), labels (M,).
 
-        Points outside the range and points that are not finite are ignored. The results are on the host.
+        Points outside the range and points that are not finite are ignored. The results are on the host. Raises
+        ValueError for points of another shape, or a reflectance beyond 1.
         """
         return self.batch([points])[0]
 
@@ -76,15 +125,68 @@ class Detector:
         """The boxes of several clouds (N, 4), detected together. Raises ValueError for points of another shape."""
         if not clouds:
             return []
-        parts = [torch.as_tensor(cloud, dtype=torch.float32, device=self.device) for cloud in clouds]
-        for part in parts:
-            if part.ndim != 2 or part.shape[1] != 4:
-                raise ValueError(f"points: want shape (N, 4) with x, y, z, reflectance, got {tuple(part.shape)}")
+        placed = [self.place(cloud) for cloud in clouds]
+        parts = [part for each in placed for part in each.clouds]
         points = torch.cat(parts)
         lengths = torch.tensor([len(part) for part in parts])
         sample = torch.repeat_interleave(torch.arange(len(parts)), lengths).to(self.device)
         levels, scores = self.maps(points, sample, len(parts))
-        return self.suppress(self.candidates(levels, scores))
+        found = self.suppress(self.candidates(levels, scores))
+        facts = torch.stack([torch.stack((each.bright, each.shift)) for each in placed]).tolist()
+        results = []
+        for k, (bright, shift) in enumerate(facts):
+            if bright:
+                raise ValueError(reflectance_error(bright))
+            results.append(self.take_back(found[k * len(self.turns) : (k + 1) * len(self.turns)], shift))
+        return results
+
+    def place(self, cloud: Tensor | NDArray) -> Placed:
+        """Moves a cloud (N, 4) to where the network expects its road, and turns it."""
+        points = as_points(cloud, self.device)
+        if not self.reflectance:
+            points = torch.cat((points[:, :3], torch.zeros_like(points[:, :1])), dim=1)
+        shift, ground = points.new_zeros(()), points.new_full((), math.nan)
+        if self.sensor_height != "none":
+            ground = ground_height(points) if self.sensor_height == "found" else points.new_tensor(-self.sensor_height)
+        if self.sensor_height != "none" and self.ground is not None:
+            shift = shift_to(ground, self.ground)
+            if self.device.type == "cuda" or shift:  # a GPU is not asked
+                points = torch.cat((points[:, :2], points[:, 2:3] + shift, points[:, 3:]), dim=1)
+        clouds = [turned(points, angle) for angle in self.turns]
+        bright = torch.stack([too_bright(each, self.config.encoder.point_range) for each in clouds]).amax()
+        return Placed(clouds, shift, ground, bright)
+
+    def look(self, cloud: Tensor | NDArray) -> Look:
+        """What the detector sees of a cloud (N, 4)."""
+        placed = self.place(cloud)
+        point_range = self.config.encoder.point_range
+        seen = torch.stack([inside(each, point_range) for each in placed.clouds]).any(dim=0)
+        count = int(seen.sum())
+        reason = range_reason(placed.clouds[0].cpu(), point_range) if count <= FEW_IN_RANGE * len(seen) else ""
+        return Look(len(seen), count, float(placed.ground), float(placed.shift), reason)
+
+    def take_back(self, found: Sequence[Detections], shift: float) -> Detections:
+        """The boxes of a cloud, found in every direction, in its own axes: those straight ahead, joined by NMS."""
+        if len(self.turns) == 1 and not self.turns[0] and not shift:
+            return found[0]
+        parts = []
+        for each, angle in zip(found, self.turns, strict=True):
+            if len(self.turns) > 1:
+                azimuth = torch.atan2(each.boxes[:, 1], each.boxes[:, 0])
+                each = each.select(azimuth.abs() <= math.pi / len(self.turns))
+            boxes = turned(each.boxes, -angle)
+            boxes[:, 2] -= shift
+            boxes[:, 6] = limit_angle(boxes[:, 6] - angle)
+            parts.append(each._replace(boxes=boxes))
+        joined = Detections(*(torch.cat(column) for column in zip(*parts, strict=True)))
+        if len(self.turns) == 1:
+            return joined
+        rows = []
+        for label, entry in enumerate(self.entries):
+            own = (joined.labels == label).nonzero().squeeze(1)
+            kept = rotated_nms(joined.boxes[own], joined.scores[own], entry.nms_iou)
+            rows.append(own[kept[: self.config.head.detections]])
+        return joined.select(torch.cat(rows))
 
     def maps(self, points: Tensor, sample: Tensor, batch_size: int) -> tuple[list[Tensor], list[Tensor]]:
         """Pyramid levels (B, C, N_L, N_W) / 2^k and the scores (B, A) of every class; on a GPU by a CUDA graph.
@@ -133,13 +235,14 @@ class Detector:
             at = (scores > head.score_threshold).nonzero().squeeze(1)
             at = at[torch.sort(scores[at], descending=True, stable=True).indices[: head.candidates]]
         else:  # as many for every cloud, so that no length is read from the device
-            at = torch.sort(scores, descending=True, stable=True).indices[: head.candidates]
+            ranked = scores.nan_to_num(nan=-1.0)  # a NaN would come first
+            at = torch.sort(ranked, descending=True, stable=True).indices[: head.candidates]
         scores = scores[at]
         values = regress(levels[entry.level][b], at, self.regression_weights[label], anchors_per_cell(entry))
         count = LOCATION_VALUES[head.regression]
         direction = values[:, count + 2 :].argmax(dim=1) if head.direction else None
         boxes = decode(values[:, :count], values[:, count : count + 2], direction, self.anchors[label][at])
-        return Candidates(boxes, scores, scores > head.score_threshold)
+        return Candidates(boxes, scores, (scores > head.score_threshold) & boxes.isfinite().all(dim=1))
 
     def suppress(self, candidates: list[list[Candidates]]) -> list[Detections]:
         """Rotated NMS class by class, and the one transfer to the host."""
@@ -244,10 +347,52 @@ def regress(level: Tensor, at: Tensor, weight: Tensor, anchors: int) -> Tensor:
     return values[torch.arange(len(at), device=at.device), at % anchors]
 
 
-def load(checkpoint: str | Path | None = None, device: str = "auto") -> Detector:
+def turned(rows: Tensor, angle: float) -> Tensor:
+    """Points (N, 4) or boxes (M, 7) with their x and y turned by an angle in radians, counter-clockwise."""
+    if not angle:
+        return rows
+    x, y = rows[:, :1], rows[:, 1:2]
+    cos, sin = math.cos(angle), math.sin(angle)
+    return torch.cat((cos * x - sin * y, sin * x + cos * y, rows[:, 2:]), dim=1)
+
+
+def turns_all_round(point_range: Sequence[float]) -> int:
+    """In how many directions a range x_min, y_min, z_min, x_max, y_max, z_max has to look to see all round.
+
+    Its opening is the angle in which it reaches SIDEWAYS as far as straight ahead.
+    """
+    x_min, y_min, _, x_max, y_max, _ = point_range
+    reach = SIDEWAYS * x_max
+    if x_min <= -reach and min(-y_min, y_max) >= reach:
+        return 1
+    side = min(-y_min, y_max)
+    if side <= 0 or reach <= 0:
+        raise InputError(f"point_range {list(point_range)}: is not around the x axis, so that it cannot look all round")
+    return math.ceil(math.pi / math.asin(min(1.0, side / reach)))
+
+
+def load(
+    checkpoint: str | Path | None = None,
+    device: str = "auto",
+    *,
+    sensor_height: float | Literal["found", "none"] = "found",
+    turn: float = 0.0,
+    all_round: bool = False,
+) -> Detector:
     """A detector from a checkpoint of `python -m hvnet.train`, by default from the weights that come with the package.
 
-    device: auto (CUDA where there is a GPU), cpu, cuda or cuda:N. Raises InputError naming the file, or the device.
+    device: auto (CUDA where there is a GPU), cpu, cuda or cuda:N. sensor_height, turn, all_round: see `Detector`.
+    Raises InputError naming the file, or the device.
     """
     path = SHIPPED if checkpoint is None else checkpoint
-    return Detector(model_from_checkpoint(load_checkpoint(path), str(path)), select_device(device))
+    content = load_checkpoint(path)
+    facts = content.get("sensor", {})
+    return Detector(
+        model_from_checkpoint(content, str(path)),
+        select_device(device),
+        ground=facts.get("ground"),
+        reflectance=facts.get("reflectance_scale") != 0,
+        sensor_height=sensor_height,
+        turn=turn,
+        all_round=all_round,
+    )

@@ -116,5 +116,7 @@ class HVNet(nn.Module):
         at = at[best]
         direction = None if maps.direction is None else maps.direction[at].argmax(dim=1)
         boxes = decode(maps.location[at], maps.vertical[at], direction, self.anchors(label)[at])
-        kept = rotated_nms(boxes, scores[at], head.classes[label].nms_iou)[: head.detections]
-        return Detections(boxes[kept], scores[at][kept], torch.full_like(kept, label))
+        finite = boxes.isfinite().all(dim=1)
+        boxes, scores = boxes[finite], scores[at][finite]
+        kept = rotated_nms(boxes, scores, head.classes[label].nms_iou)[: head.detections]
+        return Detections(boxes[kept], scores[kept], torch.full_like(kept, label))

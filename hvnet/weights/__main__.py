@@ -46,7 +46,8 @@ def halve(checkpoint: Path, out: Path) -> None:
     model = {
         name: value if name.endswith(running) else value.to(torch.float16) for name, value in content["model"].items()
     }
-    save_checkpoint(out, {"config": content["config"], "model": model})
+    facts = {"sensor": content["sensor"]} if "sensor" in content else {}
+    save_checkpoint(out, {"config": content["config"], "model": model} | facts)
 
 
 def main(arguments: Sequence[str] | None) -> None:
