@@ -3,17 +3,18 @@
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from hvnet.config import Config
+from hvnet.config import Config, DataConfig
 from hvnet.data.augment import sampler_of
 from hvnet.data.gt_database import load_database
 from hvnet.data.kitti import KittiFrames
 from hvnet.data.sources import JoinedFrames
 from hvnet.exceptions import InputError
-from hvnet.training.batches import EpochOrder, Sample, TrainingFrames, collate, seeded
+from hvnet.training.batches import Data, EpochOrder, Sample, TrainingFrames, collate, seeded, training_objects
 from tests.helpers import same
 
 CPU = torch.device("cpu")
@@ -107,6 +108,22 @@ def test_a_frame_without_labels_is_no_frame_of_background(scenes: Path, tiny: Co
     assert (sample.name, sample.note) == ("000001", "frame 000000 is skipped: frame 000000: has no labels")
     assert not isinstance(collate([sample, sample]), InputError)
     assert collate([sample, found]) is found
+
+
+def test_the_database_has_the_classes_of_the_frames(copied: Path) -> None:
+    """It is built as the training frames are read, of those that can be, and without what is validated on."""
+    reading = DataConfig(classes={"Van": "Car"})
+    data = Data(KittiFrames(copied, IDS, reading=reading), KittiFrames(copied, ["000001"]), copied)
+    said: list[str] = []
+    plain = training_objects(Data(KittiFrames(copied, IDS), data.val, copied), [0, 2], said.append)
+    assert "Van" in plain.name
+    database = training_objects(data, [0, 2], said.append)
+    assert set(database.frame.tolist()) == {"000000", "000002"}
+    assert (database.name == "Car").sum() == np.isin(plain.name, ["Car", "Van"]).sum()
+    assert "Van" not in database.name
+    assert len(said) == 1  # that it was built again
+    training_objects(data, [0, 1, 2], said.append)
+    assert "was built without 1 of the 3 training frames, such as 000001" in said[1]
 
 
 def test_batches_hold_whole_frames(scenes: Path, tiny: Config) -> None:

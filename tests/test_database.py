@@ -25,7 +25,7 @@ def test_command(copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(InputError, match=re.escape(f"{path}: already exists")):
         main(["--data", str(root)])
     main(["--data", str(root), "--split", "val", "--out", str(root / "val.npz")])
-    assert set(read_database(root / "val.npz").frame.tolist()) == {4, 5}
+    assert set(read_database(root / "val.npz").frame.tolist()) == {"000004", "000005"}
     with pytest.raises(InputError, match=re.escape(f"{root / 'none'}: not a writable folder")):
         main(["--data", str(root), "--out", str(root / "none" / "a.npz")])
     with pytest.raises(InputError, match=r"test\.txt: no such file"):

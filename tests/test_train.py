@@ -22,6 +22,7 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from hvnet.config import TrainConfig
+from hvnet.data.gt_database import read_database
 from hvnet.data.kitti import KittiFrames, read_split
 from hvnet.exceptions import InputError, Stopped
 from hvnet.network.checkpoint import load_checkpoint, save_checkpoint
@@ -52,9 +53,9 @@ def metrics(out: Path) -> list[dict[str, Any]]:
 
 
 def numbers(printed: str) -> str:
-    """What was printed, without the paths and what is said of the labels."""
-    lines = printed.splitlines()
-    return "\n".join(line for line in lines if "run is" not in line and "/" not in line and "background" not in line)
+    """What was printed, without the paths and what is said of the data."""
+    others = ("run is", "/", "background", "clouds: ")
+    return "\n".join(line for line in printed.splitlines() if not any(each in line for each in others))
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +76,7 @@ def test_what_a_run_writes(trained: tuple[Path, str]) -> None:
     out, printed = trained
     written = {"checkpoint.pt", "metrics.jsonl", "data.txt", "tensorboard", "pictures"}
     assert {path.name for path in out.iterdir()} == written
-    assert printed.startswith("4 frames to train, 2 to validate, on cpu")
+    assert printed.count("4 frames to train, 2 to validate, on cpu") == 1
     assert printed.count("labels of classes that the config does not have count as background: 3 Van\n") == 1
     for epoch, record in enumerate(metrics(out), 1):
         assert (record["epoch"], record["step"]) == (epoch, 2 * epoch)
@@ -189,6 +190,66 @@ def test_resuming_a_finished_run_changes_nothing(scenes: Path, begun: Path) -> N
     run(scenes, begun, resume=True)
     after = contents(begun)
     assert {name: after[name] for name in before} == before
+
+
+def test_frames_that_changed_since_are_said(copied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once, and the run goes on with them as they are; a file that was only touched is no change."""
+    out, training = tmp_path / "out", copied / "training"
+    changes = ["augment.objects={}", "train.learning_rate=1.0e-4"]
+    run(copied, out, "train.epochs=1", *changes)
+    stamps = load_checkpoint(out / "checkpoint.pt")["stamps"]
+    assert {split: tuple(numbers.shape) for split, numbers in stamps.items()} == {"train": (4, 4), "val": (2, 4)}
+    (training / "velodyne" / "000000.bin").touch()
+    cloud, label = training / "velodyne" / "000002.bin", training / "label_2" / "000005.txt"
+    cloud.write_bytes(cloud.read_bytes()[:-16])
+    label.write_text("")
+    printed = run(copied, out, "train.epochs=2", *changes, resume=True)
+    said = "checkpoint.pt: since it was written, frames have changed: 000002 (cloud) and 1 more; they are used as they"
+    assert printed.count(said) == 1
+    assert len(metrics(out)) == 2
+    now = load_checkpoint(out / "checkpoint.pt")["stamps"]
+    assert (now["train"][:, 3] != stamps["train"][:, 3]).tolist() == [False, False, True, False]
+    assert (now["val"][:, 0] != stamps["val"][:, 0]).tolist() == [False, True]
+    with monkeypatch.context() as patched:  # no cloud is read to see that nothing has changed
+        patched.setattr("hvnet.data.stamps._crc32", lambda path: pytest.fail(f"{path} is read"))
+        assert "since it was written" not in run(copied, out, "train.epochs=3", *changes, resume=True)
+    label.write_text("DontCare -1 -1 -10 0 0 10 10 -1 -1 -1 -1000 -1000 -1000 -10\n")
+    printed = run(copied, out, "train.epochs=3", *changes, resume=True)
+    assert "frames have changed: 000005 (labels, calibration or options of reading); they are used" in printed
+
+
+def test_a_checkpoint_without_stamps_is_resumed(copied: Path, begun: Path) -> None:
+    """Of an earlier version: nothing is known of its frames."""
+    content = load_checkpoint(begun / "checkpoint.pt")
+    del content["stamps"]
+    save_checkpoint(begun / "checkpoint.pt", content)
+    (copied / "training" / "label_2" / "000001.txt").write_text("")
+    printed = run(copied, begun, "train.epochs=3", resume=True)
+    assert "changed" not in printed
+    assert set(load_checkpoint(begun / "checkpoint.pt")["stamps"]) == {"train", "val"}
+
+
+@pytest.mark.parametrize("numbers", [torch.zeros(3, 4).long(), "none"])
+def test_broken_stamps_are_refused(scenes: Path, begun: Path, numbers: Any) -> None:
+    content = load_checkpoint(begun / "checkpoint.pt")
+    save_checkpoint(begun / "checkpoint.pt", content | {"stamps": {"train": numbers}})
+    with pytest.raises(InputError, match=r"checkpoint\.pt: does not hold a whole run \("):
+        run(scenes, begun, resume=True)
+
+
+def test_objects_of_changed_labels_are_cut_again(copied: Path, tmp_path: Path) -> None:
+    run(copied, tmp_path / "before", "train.epochs=1")
+    before = (copied / "gt_database.npz").read_bytes()
+    (copied / "training" / "label_2" / "000001.txt").write_text("")
+    printed = run(copied, tmp_path / "after", "train.epochs=1")
+    said = (
+        "gt_database.npz: is built again, as frames have changed: 000001 (labels, calibration or options of reading)\n"
+    )
+    assert printed.count(said) == 1
+    assert (copied / "gt_database.npz").read_bytes() != before
+    assert "000001" not in read_database(copied / "gt_database.npz").frame
+    assert "built again" not in run(copied, tmp_path / "again", "train.epochs=1")
+    assert metrics(tmp_path / "again") == metrics(tmp_path / "after")
 
 
 @pytest.mark.parametrize(
@@ -333,9 +394,10 @@ train.main(sys.argv[3:])
 """
 
 
-# the place, the call of it that is killed (of notes: two in the steps of an epoch, two in its validation), epochs saved
+# the place, the call of it that is killed (of notes: two in the steps of an epoch, three in its validation), and the
+# epochs that are saved
 RANDOM = np.random.default_rng(0).integers(1, 9, 3).tolist()
-PLACES = [("step", count, (count - 1) // 4) for count in RANDOM] + [("save", 2, 0), ("save", 3, 0), ("save", 4, 1)]
+PLACES = [("step", count, (count - 1) // 5) for count in RANDOM] + [("save", 2, 0), ("save", 3, 0), ("save", 4, 1)]
 
 
 @pytest.mark.parametrize(("place", "count", "epochs"), PLACES)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hvnet.cli import make_parser, run_command
+from hvnet.cli import add_reading, make_parser, read_reading, run_command
 from hvnet.data.gt_database import FILE_NAME, build_database, write_database
 from hvnet.data.kitti import KittiFrames, read_split
 from hvnet.exceptions import InputError
@@ -17,19 +17,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = make_parser(
         "data.database",
         "Cuts every labelled object out of a KITTI split: the ground-truth database for augmentation. Training builds "
-        "it by itself if the root has none.",
+        "it by itself if the root has none, or if labels or clouds of its frames have changed.",
         ["--data /data/kitti", "--data /data/kitti --split trainval --out trainval.npz"],
     )
     parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="a KITTI root")
     parser.add_argument("--split", default="train", metavar="NAME", help="of the list in ImageSets (default: train)")
     parser.add_argument("--out", type=Path, metavar="FILE", help=f"(default: {FILE_NAME} in the KITTI root)")
+    add_reading(parser)
     options = parser.parse_args(arguments)
     out: Path = options.out or options.data / FILE_NAME
     if out.exists():
         raise InputError(f"{out}: already exists; remove it or name another file with --out")
     if not os.access(out.parent, os.W_OK):  # checked before minutes of work, not after
         raise InputError(f"{out.parent}: not a writable folder; name a file elsewhere with --out")
-    database = build_database(KittiFrames(options.data, read_split(options.data, options.split), crop=False))
+    names = read_split(options.data, options.split)
+    database = build_database(KittiFrames(options.data, names, crop=False, reading=read_reading(options)))
     try:
         write_database(out, database)
     except OSError as error:

@@ -1,5 +1,8 @@
 """Training frames, augmented, in batches whose order depends on seed and epoch alone."""
 
+import contextlib
+import math
+import statistics
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,10 +19,24 @@ from hvnet.config import Config
 from hvnet.data.augment import ObjectSampler, augment, mix_sectors
 from hvnet.data.frame import Frame, Frames, check_names, frame_at, object_names
 from hvnet.data.gt_database import Database, build_database, load_database
-from hvnet.data.kitti import read_split_frames
+from hvnet.data.kitti import KittiFrames, read_split_frames
 from hvnet.data.scenes.files import generate
 from hvnet.data.scenes.street import Options
+from hvnet.data.sensor import (
+    FEW_IN_RANGE,
+    Look,
+    ground_height,
+    inside,
+    range_reason,
+    reflectance_error,
+    summary,
+    too_bright,
+)
 from hvnet.exceptions import InputError
+
+LOOKED_AT = 32
+"""Frames that tell what the training data's clouds are like."""
+ANCHOR_TOLERANCE = 0.6  # metres between the ground and the bottom of the anchors
 
 
 @dataclass(frozen=True)
@@ -34,7 +51,7 @@ class Data:
 def kitti_data(root: Path, config: Config) -> Data:
     """The frames of the config's splits in a KITTI root."""
     train, val = config.train.train_split, config.train.val_split
-    return Data(read_split_frames(root, train), read_split_frames(root, val), root)
+    return Data(read_split_frames(root, train, config.data), read_split_frames(root, val, config.data), root)
 
 
 def generated_scenes(config: Config, folder: Path) -> Path:
@@ -49,7 +66,8 @@ def generated_scenes(config: Config, folder: Path) -> Path:
 def training_objects(data: Data, good: Sequence[int], say: Callable[..., None]) -> Database:
     """The ground-truth database of the training frames that can be read: that of the KITTI root, or a new one."""
     if data.root is not None:
-        return load_database(data.root, [data.train.names[k] for k in good], data.val.names, say)
+        reading = data.train.reading if isinstance(data.train, KittiFrames) else None
+        return load_database(data.root, [data.train.names[k] for k in good], data.val.names, say, reading)
     return build_database(data.train, good)
 
 
@@ -125,6 +143,8 @@ class TrainingFrames(Dataset[Sample | InputError]):
                 frame = frame_at(self.frames, at)
                 if frame.objects is None:
                     raise InputError(f"frame {frame.name}: has no labels")
+                if highest := float(too_bright(frame.points, self.config.encoder.point_range)):
+                    raise InputError(f"frame {frame.name}: {reflectance_error(highest)}")
                 break
             except (InputError, OSError) as error:
                 if not self.config.train.skip_corrupt:
@@ -207,3 +227,39 @@ def check_frames(frames: Frames, skip: bool, say: Callable[..., None]) -> tuple[
     if not good:
         raise InputError(f"no frame of the split can be read; the last: {last}")
     return good, names
+
+
+def look_at_clouds(frames: Frames, wanted: Sequence[int], config: Config) -> tuple[dict[str, float | None], list[str]]:
+    """What a detector has to know of the clouds that it is trained with, and what a user should.
+
+    The former is the height of their `ground` in metres, None if there is none, and the `reflectance_scale`, 0 if there
+    is no reflectance. Of many frames some are looked at.
+    """
+    point_range = config.encoder.point_range
+    looks, reflectances, reasons, bright = [], [], [], False
+    for k in wanted[:: max(1, len(wanted) // LOOKED_AT)]:
+        with contextlib.suppress(InputError, OSError):  # named when its turn comes
+            frame = frame_at(frames, k)
+            points = frame.points
+            look = Look(len(points), int(inside(points, point_range).sum()), float(ground_height(points)), 0.0)
+            looks.append(look)
+            reflectances.append(frame.reflectance)
+            bright |= bool(points[:, 3].any())
+            if look.in_range <= FEW_IN_RANGE * look.points:
+                reasons.append(f"{frame.name}: {range_reason(points, point_range)}")
+    known = [look.ground for look in looks if not math.isnan(look.ground)]
+    ground = statistics.median(known) if known else None
+    if config.data.sensor_height is not None:
+        ground = -config.data.sensor_height
+    scale = max(getattr(frames, "scales", {"": 1.0}).values(), default=1.0) if bright else 0.0
+    said = [f"clouds: {summary(looks, reflectances)}"] if looks else []
+    if reasons:
+        said.append(f"in {len(reasons)} of {len(looks)} clouds few points are in range; the first is {reasons[0]}")
+    better = []
+    for entry in config.head.classes if ground is not None else ():
+        bottom = entry.anchor_z - max(size[2] for size in entry.anchor_sizes) / 2
+        if ground is not None and abs(bottom - ground) > ANCHOR_TOLERANCE:
+            better.append(f"--set head.classes.{entry.name}.anchor_z={entry.anchor_z + ground - bottom:.2f}")
+    if better:
+        said.append(f"the ground lies at {ground:.2f} m, where the anchors do not stand; better: {' '.join(better)}")
+    return {"ground": ground, "reflectance_scale": scale}, said

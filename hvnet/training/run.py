@@ -25,6 +25,8 @@ from tqdm import tqdm
 from hvnet import ranks
 from hvnet.config import Config, TrainConfig, config_from_dict, config_to_dict
 from hvnet.data.augment import sampler_of
+from hvnet.data.frame import notes
+from hvnet.data.stamps import Change, Stamps, describe_changes, find_changes, take_stamps
 from hvnet.evaluation.scoring import Detected, background_note, print_once, score
 from hvnet.evaluation.tables import format_table
 from hvnet.exceptions import InputError, Stopped
@@ -32,7 +34,16 @@ from hvnet.network.checkpoint import load_checkpoint, save_checkpoint
 from hvnet.network.detector import Detector
 from hvnet.network.model import HVNet
 from hvnet.pictures.clouds import Subject, draw_bev
-from hvnet.training.batches import Batch, Data, EpochOrder, TrainingFrames, check_frames, collate, training_objects
+from hvnet.training.batches import (
+    Batch,
+    Data,
+    EpochOrder,
+    TrainingFrames,
+    check_frames,
+    collate,
+    look_at_clouds,
+    training_objects,
+)
 
 SAVE_SECONDS = 300.0
 """Seconds between saves within an epoch; a run is also saved after every epoch."""
@@ -72,6 +83,7 @@ class Run:
         self.board: SummaryWriter | None = None  # open in `train`
         self.signals: list[int] = []
         self.seen: set[str] = set()  # notes that were printed
+        self.stamps: dict[str, Stamps] = {}  # of the training and validation frames, where their formats have some
         if ranks.rank() == 0 and not resume and self.checkpoint.exists():
             raise InputError(f"{out}: holds a run; resume it, or give another folder")
         with deterministic():
@@ -86,6 +98,7 @@ class Run:
                 self.model.parameters(), lr=config.train.learning_rate, weight_decay=config.train.weight_decay
             )
             self.progress = self.restore() if resume else Progress()
+        self.stamp_frames()
         self.say(
             f"{len(data.train)} frames to train, {len(data.val)} to validate, on {device}; the run is {out}", flush=True
         )
@@ -118,6 +131,9 @@ class Run:
         names += check_frames(data.val, False, self.say)[1]
         classes = [entry.name for entry in config.head.classes]
         self.background = background_note(names, classes)
+        self.sensor, sensor_notes = look_at_clouds(data.train, good, config)
+        for note in (*notes(data.train), *notes(data.val), *sensor_notes):
+            self.say(note)
         # worker processes do not use the GPU; without them the frames are kept on it
         place = self.device if config.train.workers == 0 else torch.device("cpu")
         objects = None
@@ -134,6 +150,23 @@ class Run:
             multiprocessing_context="spawn" if config.train.workers else None,
             worker_init_fn=ignore_signals,
         )
+
+    def stamp_frames(self) -> None:
+        """Stamps the frames as they are now, on the first rank; says which have changed since the checkpoint."""
+        if ranks.rank() > 0:
+            return
+        dataset, changes = self.loader.dataset, list[Change]()
+        assert isinstance(dataset, TrainingFrames)
+        # the clouds of the database have been read: their stamps tell what is in them
+        cut = None if dataset.objects is None else dataset.objects.database.stamps
+        for split, frames, known in (("train", self.data.train, cut), ("val", self.data.val, None)):
+            before = self.stamps.pop(split, None)
+            now = take_stamps(frames, known=before or known)
+            if now is not None:
+                self.stamps[split] = now
+                changes += [] if before is None else find_changes(before, now)
+        if changes:
+            self.say(f"{self.checkpoint}: since it was written, {describe_changes(changes)}; they are used as they are")
 
     def step(self, batch: Batch) -> dict[str, float]:
         """One step of the optimizer: the losses of the batch, summed over the ranks, and `stop`, if a signal has come.
@@ -312,6 +345,8 @@ class Run:
                 "model": self.model.state_dict(),
                 "optimizer": self.optimizer.state_dict(),
                 "frames": self.frames_id,
+                "stamps": {split: torch.from_numpy(stamps.numbers) for split, stamps in self.stamps.items()},
+                "sensor": self.sensor,
                 "random": torch.get_rng_state(),
                 **self.progress._asdict(),
             }
@@ -333,8 +368,10 @@ class Run:
             self.model.load_state_dict(content["model"])
             self.optimizer.load_state_dict(content["optimizer"])
             torch.set_rng_state(content["random"])
+            for split, numbers in content.get("stamps", {}).items():  # earlier versions keep none
+                self.stamps[split] = Stamps(getattr(self.data, split).names, numbers.numpy())
             return Progress(*(content[key] for key in Progress._fields))
-        except (KeyError, RuntimeError, ValueError, TypeError) as error:
+        except (KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
             raise InputError(f"{path}: does not hold a whole run ({error}); start again with another --out") from error
 
 
