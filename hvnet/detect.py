@@ -18,19 +18,25 @@ from hvnet.cli import (
     add_checkpoint,
     add_device,
     add_inputs,
+    add_mount,
     add_overlaps,
+    add_reading,
     make_parser,
+    of_labels,
+    read_mount,
     read_overlaps,
+    read_reading,
     run_command,
 )
 from hvnet.data.clouds import SUFFIXES
 from hvnet.data.frame import IMAGE_SIZE, Frame, Frames
-from hvnet.data.kitti import KittiFrames, frame_labels, has_camera, read_labels, write_labels
+from hvnet.data.kitti import IMAGES, KittiFrames, find_file, frame_labels, has_camera, read_labels, write_labels
 from hvnet.data.labels import Labels
+from hvnet.data.sensor import summary
 from hvnet.data.sources import find_frames
 from hvnet.evaluation.precision import evaluate
-from hvnet.evaluation.rules import KITTI, config_rules
-from hvnet.evaluation.scoring import background_note, detect_frames
+from hvnet.evaluation.rules import KITTI, Rule, config_rules
+from hvnet.evaluation.scoring import background_note, detect_frames, look_at, print_once
 from hvnet.evaluation.tables import format_table
 from hvnet.exceptions import InputError
 from hvnet.folders import check_empty
@@ -102,18 +108,31 @@ def write_submission(path: Path, results: Path) -> None:
 
 
 def detect(
-    detector: Detector, frames: Frames, out: Path, pictures: int, submit: bool = False
-) -> tuple[int, list[Labels]]:
+    detector: Detector,
+    frames: Frames,
+    out: Path,
+    pictures: int,
+    submit: bool = False,
+    *,
+    verbose: bool = False,
+    seen: set[str] | None = None,
+) -> tuple[int, dict[str, Labels]]:
     """Writes results/NAME.txt, boxes.csv and the first few pictures/NAME.png.
 
-    Returns the number of boxes, and the labels of those frames that have any. With `submit` the results are made and
-    checked for the KITTI server, and submission.zip is written last.
+    Prints what was seen of all clouds, of every cloud if `verbose`, and notes that are not in `seen`. Returns the
+    number of boxes, and the labels of the frames that have any, by name. With `submit` the results are made and checked
+    for the KITTI server, and submission.zip is written last.
     """
-    total, truths = 0, []
+    total, truths, looks, reflectances = 0, {}, [], []
     point_range = detector.config.encoder.point_range
     bar = tqdm(range(len(frames)), desc="detecting", unit="cloud", dynamic_ncols=True)
-    for k, frame, found, every in detect_frames(detector, frames, bar):
+    for k, frame, found, every in detect_frames(detector, frames, bar, seen):
         (out / "results").mkdir(parents=True, exist_ok=True)  # not before the first cloud is read
+        looks.append(look := look_at(detector, frame))
+        reflectances.append(frame.reflectance)
+        if verbose:
+            parts = (frame.in_view, look.text(), frame.reflectance)
+            tqdm.write(f"{frame.name}: {'; '.join(filter(None, parts))}")
         rows, result_file = result_rows(every, frame), out / "results" / f"{frame.name}.txt"
         write_labels(result_file, submission_rows(rows) if submit else rows)
         if submit:
@@ -129,11 +148,28 @@ def detect(
             subject = Subject(frame, found, detector.classes)
             picture(out / "pictures" / f"{frame.name}.png", subject, point_range, frame.name)
         if frame.objects is not None:
-            truths.append(frame_labels(frame))
+            truths[frame.name] = frame_labels(frame)
         total += len(found.boxes)
     if submit:
         write_submission(out / "submission.zip", out / "results")
+    tqdm.write(f"clouds:     {summary(looks, reflectances)}")
     return total, truths
+
+
+def print_scores(
+    detector: Detector, frames: Frames, truths: dict[str, Labels], results: Path, rules: dict[str, Rule]
+) -> None:
+    """Scores the results of the frames that have labels, and says which have none."""
+    names = [name for name in frames.names if name in truths]
+    if names:
+        written = [read_labels(results / f"{name}.txt", scored=True) for name in names]
+        table = evaluate([truths[name] for name in names], written, classes=detector.classes, rules=rules)
+        print(format_table(table) + "\n")
+        if without := [name for name in frames.names if name not in truths]:
+            shown = ", ".join(without[:5]) + (", ..." if len(without) > 5 else "")
+            print(f"{len(names)} of {len(frames)} frames are scored; no labels: {shown}")
+    if note := background_note((str(name) for truth in truths.values() for name in truth.name), detector.classes):
+        print(note)
 
 
 def main(arguments: Sequence[str] | None) -> None:
@@ -141,10 +177,12 @@ def main(arguments: Sequence[str] | None) -> None:
     parser = make_parser(
         "detect",
         "Detects objects in point clouds; writes KITTI result files (results/), all boxes in LiDAR axes (boxes.csv) "
-        "and bird's eye views (pictures/), which KITTI frames have below their image. Where every cloud is a KITTI "
-        "frame with labels, the results are scored. --split test writes submission.zip for the KITTI server.",
+        "and bird's eye views (pictures/), which KITTI frames have below their image. The results of KITTI frames with "
+        "labels are scored. --split test writes submission.zip for the KITTI server. docs/sensors.md has the options "
+        "for clouds of other sensors.",
         [
             "cloud.bin",
+            "nuscenes/ --all-round --turn -90",
             "cloud.pcd --checkpoint runs/demo/checkpoint.pt",
             "clouds/ --pictures 0",
             "/data/kitti --split val --out val",
@@ -164,6 +202,9 @@ def main(arguments: Sequence[str] | None) -> None:
         metavar="N",
         help="draw the first N clouds, with boxes of score 0.5 or more (default: 20)",
     )
+    parser.add_argument("--verbose", action="store_true", help="say of every cloud what was found out about it")
+    add_reading(parser)
+    add_mount(parser)
     add_overlaps(parser)
     add_device(parser)
     options = parser.parse_args(arguments)
@@ -172,7 +213,10 @@ def main(arguments: Sequence[str] | None) -> None:
     if options.partial and options.split != "test":
         raise InputError("--partial: is for --split test")
     submit = options.split == "test" and not options.partial
-    frames = find_frames(options.inputs, options.split)
+    detector = load(options.checkpoint, options.device, **read_mount(options))
+    reading = read_reading(options, of_labels(detector.config), detector.classes)
+    # looking all round wants the whole cloud, not what a camera sees
+    frames = find_frames(options.inputs, options.split, reading, crop=not options.all_round)
     roots = [part for part in frames.parts if isinstance(part, KittiFrames)]
     for folder in sorted({part.root / part.split_dir for part in roots}):
         if not has_camera(folder):
@@ -181,20 +225,16 @@ def main(arguments: Sequence[str] | None) -> None:
             print(f"{folder}: has no calib, so no camera: every point counts, and there are no 2D boxes")
     if submit:
         check_test_set(frames.names)
-        blind = sum(
-            not (part.root / part.split_dir / "image_2" / f"{n}.png").is_file() for part in roots for n in part.names
-        )
+        blind = sum(not find_file(part.folder / "image_2", n, *IMAGES).is_file() for part in roots for n in part.names)
         if blind:
             width, height = IMAGE_SIZE
             print(f"{blind} frames have no file in image_2; their 2D boxes are clipped to {width} x {height}")
-    detector = load(options.checkpoint, options.device)
     rules = config_rules(detector.config, read_overlaps(options.overlap, detector.classes))
-    total, truths = detect(detector, frames, options.out, options.pictures, submit)
-    if len(truths) == len(frames):  # all are labelled
-        written = [read_labels(options.out / "results" / f"{name}.txt", scored=True) for name in frames.names]
-        print(format_table(evaluate(truths, written, classes=detector.classes, rules=rules)) + "\n")
-    if note := background_note((str(name) for truth in truths for name in truth.name), detector.classes):
-        print(note)
+    seen: set[str] = set()  # what was printed
+    # labels are looked at before minutes of work, and stop none of it
+    print_once((part.labels(k)[1] for part in roots for k in range(len(part))), seen)
+    total, truths = detect(detector, frames, options.out, options.pictures, submit, verbose=options.verbose, seen=seen)
+    print_scores(detector, frames, truths, options.out / "results", rules)
     print(f"{total} boxes in {len(frames)} cloud{'s' * (len(frames) != 1)}")
     print(f"results:    {options.out / 'results'}\nboxes:      {options.out / 'boxes.csv'}")
     if options.pictures > 0:

@@ -10,11 +10,23 @@ from typing import get_args
 
 from tqdm import tqdm
 
-from hvnet.cli import add_checkpoint, add_device, add_inputs, make_parser, run_command
+from hvnet.cli import (
+    add_checkpoint,
+    add_device,
+    add_inputs,
+    add_mount,
+    add_reading,
+    make_parser,
+    of_labels,
+    read_mount,
+    read_reading,
+    run_command,
+)
 from hvnet.data.clouds import SUFFIXES
 from hvnet.data.frame import Frame
+from hvnet.data.sensor import summary
 from hvnet.data.sources import find_frames
-from hvnet.evaluation.scoring import detect_frames
+from hvnet.evaluation.scoring import detect_frames, look_at
 from hvnet.exceptions import InputError
 from hvnet.folders import check_empty
 from hvnet.network.detector import Detector, load
@@ -55,17 +67,20 @@ def main(arguments: Sequence[str] | None) -> None:
     parser.add_argument("--colour", choices=get_args(Colour), default="height", help="of the points (default: height)")
     parser.add_argument("--out", type=Path, default=Path("figures"), metavar="DIR", help="(default: figures)")
     parser.add_argument("--format", choices=FORMATS, default="png", help="(default: png)")
+    add_reading(parser)
+    add_mount(parser)
     add_device(parser)
     options = parser.parse_args(arguments)
 
     check_empty(options.out)
     if options.compare and not options.features:
         raise InputError("--compare: is for --features; give both")
-    frames = find_frames(options.inputs, options.split)
+    detector = load(options.checkpoint, options.device, **read_mount(options))
+    reading = read_reading(options, of_labels(detector.config), detector.classes)
+    frames = find_frames(options.inputs, options.split, reading, crop=not options.all_round)
     if options.features and (clash := set(frames.names) & {f"{name}-features" for name in frames.names}):
         name = min(clash)
         raise InputError(f"{name}: has the name of the features of {name.removesuffix('-features')}; rename one")
-    detector = load(options.checkpoint, options.device)
     models = [(detector, options.checkpoint.stem if options.checkpoint else "shipped weights")]
     if options.compare:
         models.append((load(options.compare, options.device), options.compare.stem))
@@ -74,12 +89,15 @@ def main(arguments: Sequence[str] | None) -> None:
                 (each, str(path)) for (each, _), path in zip(models, (options.checkpoint, options.compare), strict=True)
             ]
     bar = tqdm(range(len(frames)), desc="drawing", unit="cloud", dynamic_ncols=True)
+    looks, reflectances = [], []
     for _, frame, found, _ in detect_frames(detector, frames, bar):
+        looks.append(look_at(detector, frame))
+        reflectances.append(frame.reflectance)
         draw(frame, found, detector, options.out / f"{frame.name}.{options.format}", options.colour)
         if options.features:
-            features = [features_of(each, frame.points, name) for each, name in models]
+            features = [features_of(each, each.place(frame.points).clouds[0], name) for each, name in models]
             draw_features(options.out / f"{frame.name}-features.{options.format}", features, frame.name)
-    print(f"figures: {options.out}")
+    print(f"clouds:  {summary(looks, reflectances)}\nfigures: {options.out}")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,15 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from hvnet.cli import add_device, add_overlaps, make_parser, read_overlaps, run_command
+from hvnet.cli import (
+    add_device,
+    add_overlaps,
+    add_reading,
+    make_parser,
+    read_overlaps,
+    read_reading,
+    run_command,
+)
 from hvnet.data.kitti import read_split_frames
 from hvnet.evaluation.rules import config_rules
 from hvnet.exceptions import InputError
@@ -54,6 +62,7 @@ def main(arguments: Sequence[str] | None) -> None:
     parser.add_argument(
         "--min-score", type=_share, default=0.5, metavar="X", help="detections below do not count (default: 0.5)"
     )
+    add_reading(parser)
     add_overlaps(parser)
     add_device(parser)
     options = parser.parse_args(arguments)
@@ -68,11 +77,12 @@ def main(arguments: Sequence[str] | None) -> None:
     if not out.parent.is_dir() and (out.parent.exists() or not out.parent.parent.is_dir()):
         raise InputError(f"{out.parent}: no folder; --out names the page, such as mistakes.html")
     detector = load(run.checkpoint, options.device)
+    reading = read_reading(options, detector.config.data, detector.classes)
     page = make_page(
         run.checkpoint,
         run.metrics,
         detector,
-        read_split_frames(root, detector.config.train.val_split),
+        read_split_frames(root, detector.config.train.val_split, reading),
         of=str(root),
         count=options.count,
         min_score=options.min_score,

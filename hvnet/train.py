@@ -1,10 +1,20 @@
 """Training: `python -m hvnet.train`. Without arguments it trains the demo on generated scenes."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from hvnet import ranks
-from hvnet.cli import add_changes, add_device, make_parser, run_command
+from hvnet.cli import (
+    add_changes,
+    add_device,
+    add_reading,
+    add_sensor_height,
+    make_parser,
+    read_reading,
+    read_sensor_height,
+    run_command,
+)
 from hvnet.config import load_config
 from hvnet.exceptions import InputError
 from hvnet.network.devices import select_device
@@ -45,11 +55,18 @@ def main(arguments: Sequence[str] | None) -> None:
     parser.add_argument("--data", type=Path, metavar="DIR", help="a KITTI root (default: generate scenes)")
     parser.add_argument("--out", metavar="DIR", help="folder of the run (default: runs/NAME of the config)")
     parser.add_argument("--resume", action="store_true", help="continue the run in --out (default: the latest)")
+    add_reading(parser)
+    add_sensor_height(parser)
     add_device(parser)
     add_changes(parser, "override a config value, such as train.epochs=3")
     options = parser.parse_args(arguments)
 
     config = load_config(options.config, options.set)
+    reading = read_reading(options, config.data, [entry.name for entry in config.head.classes])
+    height = read_sensor_height(options)
+    if height == "none":
+        raise InputError("--sensor-height none: training moves no cloud; give metres, or leave it out")
+    config = replace(config, data=reading if height is None else replace(reading, sensor_height=height))
     device = ranks.start(select_device(options.device))
     out = ranks.broadcast(choose_out(options.out, options.config, options.resume) if ranks.rank() == 0 else None)
     if ranks.rank() == 0:

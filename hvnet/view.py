@@ -6,7 +6,19 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from hvnet.cli import add_checkpoint, add_device, add_overlaps, make_parser, read_overlaps, run_command
+from hvnet.cli import (
+    add_checkpoint,
+    add_device,
+    add_mount,
+    add_overlaps,
+    add_reading,
+    make_parser,
+    of_labels,
+    read_mount,
+    read_overlaps,
+    read_reading,
+    run_command,
+)
 from hvnet.data.clouds import SUFFIXES
 from hvnet.data.scenes.files import generate
 from hvnet.data.scenes.street import Options
@@ -60,6 +72,8 @@ def main(arguments: Sequence[str] | None) -> None:
     parser.add_argument("--split", metavar="NAME", help="frames of ImageSets/NAME.txt of a KITTI root (default: all)")
     parser.add_argument("--port", type=int, default=8080, metavar="N", help="or the next that is free (default: 8080)")
     parser.add_argument("--host", default="127.0.0.1", metavar="NAME", help="address to listen at (default: 127.0.0.1)")
+    add_reading(parser)
+    add_mount(parser)
     add_overlaps(parser)
     add_device(parser)
     options = parser.parse_args(arguments)
@@ -68,12 +82,14 @@ def main(arguments: Sequence[str] | None) -> None:
         raise InputError("the viewer needs viser: pip install 'hvnet[view]' (from a clone: pip install -e '.[view]')")
     data, checkpoint = choose_data(options.input, options.data, options.checkpoint)
     with tempfile.TemporaryDirectory() as folder:
-        detector = load(checkpoint, options.device)
+        detector = load(checkpoint, options.device, **read_mount(options))
         if data is None:
             data = Path(folder)
             distance = (4.0, min(detector.config.encoder.point_range[3] - 2, 80.0))
             generate(data, 0, DEMO_FRAMES, seed=1, options=Options(distance=distance))
-        frames = find_frames([data], options.split)
+        given = detector.config.data if data != options.input else of_labels(detector.config)  # of a run, or another
+        reading = read_reading(options, given, detector.classes)
+        frames = find_frames([data], options.split, reading, crop=not options.all_round)
         rules = config_rules(detector.config, read_overlaps(options.overlap, detector.classes))
         server = start_server(options.host, options.port)
         try:

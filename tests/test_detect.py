@@ -479,3 +479,160 @@ def test_the_command(checkpoint: Path, tmp_path: Path) -> None:
     assert failed.returncode == 2
     assert failed.stdout == ""
     assert failed.stderr == f"error: {missing}: no such file or folder\n"
+
+
+# --- clouds of other sensors, and labels that are not as they should be ----------------------------------------------
+
+
+def printed_by(capsys: pytest.CaptureFixture[str]) -> str:
+    """What was printed, without progress bars."""
+    out, err = capsys.readouterr()
+    return out + "".join(line + "\n" for line in re.split(r"[\r\n]", err) if "detecting" not in line)
+
+
+def test_labels_never_stop_a_detection(
+    checkpoint: Path, copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What cannot be read is said before the first frame, and left out of the scoring, as is a frame without labels."""
+    labels = copied / "training" / "label_2"
+    (labels / "000001.txt").write_text("Car 0 0\n")
+    (labels / "000002.txt").unlink()
+    (labels / "000003.txt").write_bytes(b"\xff\xfe\x00garbage")
+    detect(checkpoint, tmp_path / "out", copied)
+    printed = printed_by(capsys)
+    assert printed.count(f"{labels / '000001.txt'}:1: 3 fields, expected 15") == 1
+    assert printed.count(f"{labels / '000003.txt'}: not a text file; the frame counts as not labelled") == 1
+    assert printed.index("000003.txt") < printed.index("Car: ")
+    assert "3 of 6 frames are scored; no labels: 000001, 000002, 000003" in printed
+    assert "Car: 24 detections in 3 frames" in printed
+    assert sorted(path.stem for path in (tmp_path / "out" / "results").iterdir()) == [f"{k:06d}" for k in range(6)]
+
+
+def test_labels_whose_calibration_is_missing(
+    checkpoint: Path, copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for folder in ("calib", "image_2"):
+        shutil.rmtree(copied / "training" / folder, ignore_errors=True)
+    detect(checkpoint, tmp_path / "out", copied)
+    printed = printed_by(capsys)
+    assert "no such folder, but the labels of frame 000000 have 2D boxes" in printed
+    assert "Car: 48 detections" not in printed
+    assert len(list((tmp_path / "out" / "results").iterdir())) == 6
+
+
+def test_classes_by_other_names(
+    checkpoint: Path, copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    detect(checkpoint, tmp_path / "a", copied)
+    wanted = printed_by(capsys)
+    for path in (copied / "training" / "label_2").iterdir():
+        path.write_text(re.sub("^Car ", "car ", path.read_text(), flags=re.M).replace("Cyclist", "bicycle"))
+    detect(checkpoint, tmp_path / "b", copied)
+    printed = " ".join(printed_by(capsys).split())
+    assert "count as background: " in printed
+    assert "--classes car=Car counts them" in printed
+    detect(checkpoint, tmp_path / "c", copied, options=("--classes", "bicycle=Cyclist", "--classes", "car=Car"))
+    renamed = printed_by(capsys)
+    assert renamed.replace(str(tmp_path / "c"), "") == wanted.replace(str(tmp_path / "a"), "")
+    with pytest.raises(InputError, match="--classes bicycle=Bike: no class Bike; there are Car, Pedestrian, Cyclist"):
+        detect(checkpoint, tmp_path / "d", copied, options=("--classes", "bicycle=Bike"))
+
+
+def test_lines_of_clouds(tmp_path: Path, capsys: pytest.CaptureFixture[str], kitti_root: Path) -> None:
+    """One line a cloud with --verbose, one line a call without."""
+    points = read_points(kitti_root / "training" / "velodyne" / "000008.bin") * np.float32([1, 1, 1, 255])
+    np.save(tmp_path / "a.npy", points + np.float32([0, 0, 1.4, 0]))
+    np.save(tmp_path / "b.npy", points[::2])
+    line = r"clouds:     61,278 to 122,555 points, \d\d % in range, ground -1.\d\d to -0.\d\d m, 1 of 2 moved by "
+    line += r"-1.\d\d m, reflectance / 255\n"
+    first = r"a: 122,555 points, \d\d,\d\d\d in range; ground at -0.\d\d m, moved to -1.66 m; reflectance / 255\n"
+    for options in ((), ("--verbose",)):
+        out = tmp_path / f"out{len(options)}"
+        main([str(tmp_path), "--out", str(out), "--device", "cpu", "--pictures", "0", *options])
+        printed = printed_by(capsys)
+        assert len(re.findall(line, printed)) == 1
+        assert printed.count("reflectance was divided by 255") == 1
+        assert len(re.findall(first, printed)) == len(options)
+        assert len(re.findall(r"b: 61,278 points, ", printed)) == len(options)
+
+
+@pytest.mark.parametrize(("scale", "shift", "said"), [
+    (1000, 0, "as in millimetres; metres are wanted"),
+    (1, 500_000, "as map coordinates do; subtract the sensor's position"),
+])  # fmt: skip
+def test_why_nothing_is_in_range(
+    scale: float, shift: float, said: str, tmp_path: Path, checkpoint: Path, cloud: NDArray[np.float32],
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    np.save(tmp_path / "far.npy", cloud * np.float32([scale, scale, scale, 1]) + np.float32([shift, shift, 0, 0]))
+    detect(checkpoint, tmp_path / "out", tmp_path / "far.npy")
+    assert re.search(rf"far: \d+ of [\d,]+ points are in range: .*{said}", printed_by(capsys))
+
+
+def test_a_calibration_that_is_the_identity(
+    checkpoint: Path, copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As converters write it for data without a camera: its z, which is up, is taken for the depth."""
+    for path in (copied / "training" / "calib").iterdir():
+        identity = "1 0 0 0 0 1 0 0 0 0 1 0"
+        path.write_text(f"P2: {identity}\nR0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: {identity}\n")
+    detect(checkpoint, tmp_path / "out", copied)
+    assert "Tr_velo_to_cam is the identity, and a camera's axes are x right, y down, z forward" in printed_by(capsys)
+
+
+def test_frames_without_image(
+    checkpoint: Path, copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = copied / "training" / "image_2"
+    images.mkdir(exist_ok=True)
+    for path in images.iterdir():
+        path.unlink()
+    Image.new("RGB", (1242, 375)).save(images / "000000.JPG", format="jpeg")
+    Image.new("RGB", (1242, 375)).save(images / "000001.jpeg")
+    detect(checkpoint, tmp_path / "out", copied)
+    said = f"{images}: has no image of 4 of 6 frames; their size is taken to be 1242 x 375"
+    assert printed_by(capsys).count(said) == 1
+
+
+def test_suffixes_in_any_case(checkpoint: Path, copied: Path, tmp_path: Path) -> None:
+    detect(checkpoint, tmp_path / "a", copied)
+    training = copied / "training"
+    for folder, suffix in (("velodyne", ".BIN"), ("label_2", ".TXT"), ("calib", ".Txt")):
+        for path in list((training / folder).iterdir()):
+            path.rename(path.with_suffix(suffix))
+    detect(checkpoint, tmp_path / "b", copied)
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+
+
+def test_all_round_takes_the_whole_cloud(tmp_path: Path, kitti_root: Path) -> None:
+    """Of a frame with a camera too: its results are those in the image, boxes.csv has all."""
+    for name in ("velodyne", "calib", "label_2"):
+        (tmp_path / "root" / "training" / name).mkdir(parents=True)
+        file = next((kitti_root / "training" / name).glob("000008.*"))
+        shutil.copy(file, tmp_path / "root" / "training" / name)
+    options = ["--device", "cpu", "--pictures", "1"]
+    main([str(tmp_path / "root"), "--out", str(tmp_path / "ahead"), *options])
+    main([str(tmp_path / "root"), "--out", str(tmp_path / "round"), "--all-round", *options])
+    ahead, around = table(tmp_path / "ahead"), table(tmp_path / "round")
+    assert all(float(row["x"]) > -3 for row in ahead)
+    assert sum(float(row["x"]) < -3 and float(row["score"]) > 0.3 for row in around) >= 3
+    results = read_labels(tmp_path / "round" / "results" / "000008.txt", scored=True)
+    assert 0 < len(results) < len(around)
+    assert (results.location[:, 2] > -3).all()
+
+
+@pytest.mark.parametrize(("options", "said"), [
+    (("--columns", "2"), "--columns 2: want 3 to 16"),
+    (("--columns", "x,y"), "--columns x,y: want a number"),
+    (("--reflectance-scale", "0"), "--reflectance-scale 0: want a number above 0, or none"),
+    (("--reflectance-scale", "nan"), "--reflectance-scale nan: want"),
+    (("--reflectance-scale", "bright"), "--reflectance-scale bright: want"),
+    (("--sensor-height", "-2"), "--sensor-height -2: want metres from 0 to 100, or none"),
+    (("--sensor-height", "high"), "--sensor-height high: want metres"),
+    (("--turn", "left"), "--turn left: want degrees from -360 to 360"),
+    (("--turn", "nan"), "--turn nan: want degrees"),
+    (("--classes", "bicycle"), "--classes bicycle: want NAME=CLASS"),
+])  # fmt: skip
+def test_options_that_mean_nothing(options: tuple[str, str], said: str, checkpoint: Path, scenes: Path) -> None:
+    with pytest.raises(InputError, match=re.escape(said)):
+        detect(checkpoint, scenes / "never", scenes, options=(f"{options[0]}={options[1]}",))

@@ -75,7 +75,7 @@ def test_frames_of_another_format(tmp_path: Path) -> None:
     own = ["augment.objects={}", "head.classes.Cyclist.name=excavator"]
     few = ["head.score_threshold=0.0", "head.candidates=50", "head.detections=1"]
     save_untrained(tmp_path / "model.pt", [*TINY, *few, *own])
-    points = torch.rand(500, 4, generator=torch.Generator().manual_seed(0)) * 10
+    points = torch.rand(500, 4, generator=torch.Generator().manual_seed(0)) * torch.tensor([10, 10, 10, 1])
     objects = Objects(torch.tensor([[10.0, 0, -1, 4, 2, 1.5, 0]]), ["excavator"])
     frames = GivenFrames(Frame("first", points, objects, CAMERA), Frame("second", points, objects))
     page = Page(page_of(tmp_path / "model.pt", frames, 2, 1.0))

@@ -1,6 +1,7 @@
 """Runs a detector on frames of any format and scores what it finds."""
 
 import textwrap
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -9,11 +10,13 @@ from tqdm import tqdm
 
 from hvnet import ranks
 from hvnet.config import Config
-from hvnet.data.frame import Frame, Frames, check_names, frame_at
+from hvnet.data.frame import Frame, Frames, check_names, frame_at, notes
 from hvnet.data.kitti import centres_to_lidar, detections_to_labels, frame_labels
 from hvnet.data.labels import DONTCARE, Labels, count_others
+from hvnet.data.sensor import Look
 from hvnet.evaluation.precision import evaluate
 from hvnet.evaluation.rules import Rule, config_rules
+from hvnet.exceptions import InputError
 from hvnet.network.detector import Detector
 from hvnet.network.model import Detections
 
@@ -32,12 +35,29 @@ def detect_frames(
 ) -> Iterator[Detected]:
     """Reads frames and detects in them; the notes on their files are printed, each once (those in `seen` not again)."""
     seen = set() if seen is None else seen
+    print_once(notes(frames), seen)
     for k in range(len(frames)) if wanted is None else wanted:
         frame = frame_at(frames, k)
         print_once(frame.notes, seen)
-        found = detector(frame.points)
+        found = detect_frame(detector, frame)
         names = found.names(detector.classes)
         yield Detected(k, frame, found, detections_to_labels(found.boxes, found.scores, names, frame.camera))
+
+
+def detect_frame(detector: Detector, frame: Frame) -> Detections:
+    """What a detector finds in a frame. Raises InputError naming it if its points are not what a detector takes."""
+    try:
+        return detector(frame.points)
+    except ValueError as error:
+        raise InputError(f"frame {frame.name}: {error}") from error
+
+
+def look_at(detector: Detector, frame: Frame) -> Look:
+    """What a detector sees of a frame's cloud; if that is next to nothing, the reason is printed."""
+    look = detector.look(frame.points)
+    if look.reason and (look.points or frame.camera is None):  # a camera that sees nothing is in the frame's notes
+        tqdm.write(f"{frame.name}: {look.in_range:,} of {look.points:,} points are in range: {look.reason}")
+    return look
 
 
 def score(
@@ -88,10 +108,14 @@ def labels_in_range(frame: Frame, config: Config) -> Labels:
 
 def background_note(names: Iterable[str], classes: Iterable[str]) -> str:
     """How many of the labels have a class that is not among these, in lines of 100 characters; empty if none."""
+    names, classes = Counter(names), list(classes)
     others = count_others(names, classes)
     if not others:
         return ""
-    return textwrap.fill(f"labels of classes that the config does not have count as background: {others}", 100)
+    known = {name.lower(): name for name in classes}
+    alike = [f"{name}={known[name.lower()]}" for name in sorted(names) if known.get(name.lower(), name) != name]
+    hint = f"; --classes {','.join(alike)} counts them" if alike else ""
+    return textwrap.fill(f"labels of classes that the config does not have count as background: {others}{hint}", 100)
 
 
 def print_once(notes: Iterable[str], seen: set[str]) -> None:

@@ -24,9 +24,10 @@ from hvnet.boxes import EDGES, box_corners
 from hvnet.data.frame import Frame, Frames, check_names, frame_at, object_names
 from hvnet.evaluation.mistakes import MISS, Mistake, find_mistakes, worst
 from hvnet.evaluation.rules import Rule, config_rules
+from hvnet.evaluation.scoring import detect_frame
 from hvnet.exceptions import InputError
 from hvnet.kernels.voxel import Grid, voxel_index
-from hvnet.network.detector import Detector
+from hvnet.network.detector import Detector, turned
 from hvnet.network.encoder import HybridVoxelEncoder
 from hvnet.network.model import Detections
 from hvnet.network.pillars import PillarEncoder
@@ -144,6 +145,7 @@ class Viewer:
         self.lock = threading.RLock()
         self.wanted = 0  # the frame that was asked for last
         self.frame, self.detections = Frame("", torch.zeros(0, 4)), NOTHING  # what is shown
+        self.look = detector.look(self.frame.points)
         self.texts: list[tuple[viser.LabelHandle, float]] = []  # of every box of this frame, and its score
         self.found: dict[int, Detections] = {}  # of every frame that was examined
         self.mistakes: dict[int, list[Mistake]] = {}  # of every labelled frame that was examined
@@ -197,7 +199,7 @@ class Viewer:
         with self.lock:
             frame = frame_at(self.frames, index)
             if index not in self.found:
-                self.found[index] = self.detector(frame.points)
+                self.found[index] = detect_frame(self.detector, frame)
                 if frame.objects is not None:
                     self.mistakes[index] = find_mistakes(frame, self.found[index], self.rules, SHOWN_SCORE)
             return frame, self.found[index]
@@ -271,7 +273,7 @@ class Viewer:
     def show(self, frame: Frame, found: Detections) -> None:
         """Draws a frame. Raises InputError if its image cannot be read."""
         image = frame.camera.read_image() if frame.camera is not None else None
-        self.frame, self.detections = frame, found
+        self.frame, self.detections, self.look = frame, found, self.detector.look(frame.points)
         truth, names = (NOTHING.boxes, ()) if frame.objects is None else (frame.objects.boxes, frame.objects.names)
         with self.server.atomic():
             self.chooser.value = frame.name  # type: ignore[misc]  # mypy misses viser's setter
@@ -320,7 +322,10 @@ class Viewer:
             ]
             if self.frame.objects is not None:
                 counts.append(f"{len(self.frame.objects.boxes)} labelled")
-            self.info.content = paragraph(", ".join(counts), *self.frame.notes)
+            seen = [self.look.text()] * (self.look.points > 0) + [f"few are in range: {self.look.reason}"] * bool(
+                self.look.reason
+            )
+            self.info.content = paragraph(", ".join(counts), *seen, *self.frame.notes)
 
     def draw_overlay(self) -> None:
         """Lays the pseudo-image that is chosen on the ground."""
@@ -330,17 +335,20 @@ class Viewer:
                 return
             level = list(self.images).index(self.overlay.value)
             grid = self.images[self.overlay.value]
-            points = self.frame.points.to(self.detector.device)
+            points, angle = self.detector.place(self.frame.points).clouds[0], self.detector.turns[0]
             sample = torch.zeros(len(points), dtype=torch.int64, device=points.device)
             picture = norm_image(self.detector.encode(points, sample, 1)[level][0])
             sharp = max(1, 1024 // max(grid.shape))  # a browser smooths what it enlarges
             length, width = (cells * cell for cells, cell in zip(grid.shape, grid.cell, strict=True))
+            centre = torch.tensor([[grid.x_min + length / 2, grid.y_min + width / 2]])
+            x, y = turned(centre, -angle)[0].tolist()  # back to the cloud's own axes
             self.server.scene.add_image(
                 "/pseudo-image",
                 picture.repeat(sharp, axis=0).repeat(sharp, axis=1),
                 length,
                 width,
-                position=(grid.x_min + length / 2, grid.y_min + width / 2, ground_height(self.frame.points)),
+                wxyz=(math.cos(angle / 2), 0, 0, -math.sin(angle / 2)),
+                position=(x, y, ground_height(self.frame.points)),
             )
 
     def lines(self, name: str, boxes: Tensor, colour: str, pixels: float) -> None:
