@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+MAX_PAIRS = 2**20
+"""Points times boxes that are compared at a time: what is worked out of them takes 8 MB a number in float64."""
 # pairs of corners, in the order of box_corners: four edges at the bottom, four at the top, four between them
 EDGES = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]])
 
@@ -42,9 +44,36 @@ def box_corners(boxes: Tensor) -> Tensor:
 
 def points_in_boxes(points: Tensor, boxes: Tensor) -> Tensor:
     """Which of the points (N, 3 or more) lie in or on which of the boxes (M, 7): bool (N, M)."""
+    cos, sin = boxes[:, 6].cos(), boxes[:, 6].sin()
+    inside = torch.empty(len(points), len(boxes), dtype=torch.bool, device=points.device)
+    # a part of the points at a time: what is worked out besides the result would take many times its memory
+    rows = max(1, MAX_PAIRS // max(1, len(boxes)))
+    for begin in range(0, len(points), rows):
+        inside[begin : begin + rows] = _inside(points[begin : begin + rows], boxes, cos, sin)
+    return inside
+
+
+def indices_in_boxes(points: Tensor, boxes: Tensor) -> list[Tensor]:
+    """For each of the boxes (M, 7) the indices, ascending, of the points (N, 3 or more) in or on it.
+
+    The same as `points_in_boxes`, without its (N, M) mask.
+    """
+    cos, sin = boxes[:, 6].cos(), boxes[:, 6].sin()
+    # no point in a box is further from its centre in x; the tenth is far more than any rounding
+    reach = (boxes[:, 3] + boxes[:, 4]) * 0.55
+    x = points[:, 0].to(torch.promote_types(points.dtype, boxes.dtype)).contiguous()
+    found = []
+    for k in range(len(boxes)):
+        one = slice(k, k + 1)  # not k, whose scalars would not widen the points to the dtype of the boxes
+        near = ((x - boxes[one, 0]).abs() <= reach[one]).nonzero()[:, 0]
+        found.append(near[_inside(points[near], boxes[one], cos[one], sin[one])[:, 0]])
+    return found
+
+
+def _inside(points: Tensor, boxes: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+    """The mask (N, M) of `points_in_boxes`; cosine and sine (M,) are those of the boxes' yaw."""
     # one coordinate at a time: three times as fast as a (N, M, 3) tensor
     x, y, z = (points[:, axis, None] - boxes[:, axis] for axis in range(3))  # (N, M)
-    cos, sin = boxes[:, 6].cos(), boxes[:, 6].sin()
     inside = (x * cos + y * sin).abs() * 2 <= boxes[:, 3]
     inside &= (y * cos - x * sin).abs() * 2 <= boxes[:, 4]
     return inside & (z.abs() * 2 <= boxes[:, 5])

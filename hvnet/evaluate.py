@@ -5,13 +5,13 @@ import json
 import math
 import textwrap
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hvnet.cli import add_overlaps, make_parser, read_overlaps, run_command
 from hvnet.data.kitti import TYPES
-from hvnet.data.labels import DONTCARE, Labels, count_others
-from hvnet.evaluation.folders import read_folders, read_point_counts
+from hvnet.data.labels import DONTCARE, Labels, class_map, count_others, rename
+from hvnet.evaluation.folders import Folders, check_axes, read_folders, read_point_counts
 from hvnet.evaluation.matching import LEVELS_WITHOUT_2D, Level, distance_levels
 from hvnet.evaluation.precision import evaluate
 from hvnet.evaluation.rules import KITTI, rule_for
@@ -48,6 +48,32 @@ def choose_classes(given: Sequence[str] | None, labels: Sequence[Labels], predic
     return list(given)
 
 
+def read_classes(given: Sequence[str] | None) -> tuple[list[str] | None, dict[str, str]]:
+    """The classes of --classes, None if it is not given, and the names that count as one of them.
+
+    Raises InputError for a mapping that means nothing.
+    """
+    if given is None:
+        return None, {}
+    renamed = class_map([text for text in given if "=" in text])
+    bare = [text for text in given if "=" not in text]
+    return list(dict.fromkeys([*bare, *renamed.values()])), renamed
+
+
+def rename_all(folders: Folders, renamed: Mapping[str, str]) -> Folders:
+    """The labels and results with their names replaced. Raises InputError for a name that is nowhere."""
+    rows = (*folders.labels, *folders.predictions)
+    found = {name for frame in rows for name in frame.name.tolist()} - {DONTCARE}
+    for name, meant in renamed.items():
+        if name not in found and name not in TYPES:
+            there = f"there are {', '.join(sorted(found))}" if found else "there are none"
+            raise InputError(f"--classes {name}={meant}: no label or result is named {name}; {there}")
+    return folders._replace(
+        labels=[rename(frame, renamed) for frame in folders.labels],
+        predictions=[rename(frame, renamed) for frame in folders.predictions],
+    )
+
+
 def main(argv: Sequence[str] | None) -> None:
     """The command `python -m hvnet.evaluate`."""
     parser = make_parser(
@@ -60,6 +86,7 @@ def main(argv: Sequence[str] | None) -> None:
             "--labels labels --predictions results --distance-bands 0-20 20-40",
             "--labels labels --predictions results --score 0.5 --classes Car",
             "--labels labels --predictions results --classes Truck --overlap Truck=0.5",
+            "--labels labels --predictions results --classes Car bicycle=Cyclist",
         ],
     )
     parser.add_argument("--labels", type=Path, required=True, metavar="DIR", help="label files (KITTI's label_2)")
@@ -72,7 +99,8 @@ def main(argv: Sequence[str] | None) -> None:
         "--classes",
         nargs="+",
         metavar="CLASS",
-        help="(default: Car, Pedestrian and Cyclist, and every class that KITTI does not know)",
+        help="to score (default: Car, Pedestrian and Cyclist, and every class that KITTI does not know); NAME=CLASS: "
+        "labels and results of this name count as this class, which is scored, such as bicycle=Cyclist",
     )
     add_overlaps(parser)
     parser.add_argument(
@@ -86,6 +114,12 @@ def main(argv: Sequence[str] | None) -> None:
         nargs="+",
         metavar="FROM-TO",
         help="levels from the distance in metres alone, such as 0-20 20-40 40-60",
+    )
+    parser.add_argument(
+        "--same-axes",
+        action="store_true",
+        help="3D boxes of labels and of results are in the same axes, although only one side has 2D boxes (else an "
+        "error)",
     )
     parser.add_argument(
         "--score", type=float, metavar="X", help="the report counts detections from this score (default: best F1)"
@@ -107,8 +141,12 @@ def main(argv: Sequence[str] | None) -> None:
     levels: Sequence[Level] | None = LEVELS_WITHOUT_2D if args.no_2d_filter else None
     if args.distance_bands:
         levels = distance_levels(args.distance_bands)
-    frames, labels, predictions = read_folders(args.labels, args.predictions, args.frames, args.missing_as_empty)
-    classes = choose_classes(args.classes, labels, predictions)
+    given, renamed = read_classes(args.classes)
+    folders = read_folders(args.labels, args.predictions, args.frames, args.missing_as_empty)
+    if not args.same_axes:
+        check_axes(args.labels, args.predictions, folders)
+    frames, labels, predictions, missing = rename_all(folders, renamed)
+    classes = choose_classes(given, labels, predictions)
     overlaps = read_overlaps(args.overlap, classes)
     points = read_point_counts(args.clouds, frames, labels) if args.clouds else None
     result = evaluate(
@@ -121,8 +159,7 @@ def main(argv: Sequence[str] | None) -> None:
         points=points,
     )
     print(format_table(result))
-    without = sum(not (args.predictions / f"{frame}.txt").is_file() for frame in frames)
-    empty = f", {without} of them without a result file, counted as empty" if without else ""
+    empty = f", {len(missing)} of them without a result file, counted as empty" if missing else ""
     print(f"\n{len(frames)} frame{'s' * (len(frames) != 1)} scored{empty}")
     for what, rows in (("labels", labels), ("results", predictions)):
         if others := count_others((name for frame in rows for name in frame.name.tolist()), classes):

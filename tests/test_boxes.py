@@ -6,7 +6,15 @@ import pytest
 import torch
 from shapely.geometry import Polygon
 
-from hvnet.boxes import bev_corners, box_corners, boxes_collide, limit_angle, points_in_boxes
+from hvnet.boxes import (
+    MAX_PAIRS,
+    bev_corners,
+    box_corners,
+    boxes_collide,
+    indices_in_boxes,
+    limit_angle,
+    points_in_boxes,
+)
 from tests.helpers import random_boxes
 
 ANGLES = [
@@ -75,6 +83,46 @@ def test_points_in_boxes_agrees_with_the_corners() -> None:
 def test_points_in_boxes_of_nothing() -> None:
     assert points_in_boxes(torch.zeros(0, 4), torch.zeros(3, 7)).shape == (0, 3)
     assert points_in_boxes(torch.zeros(5, 4), torch.zeros(0, 7)).shape == (5, 0)
+
+
+def whole_mask(points: torch.Tensor, boxes: torch.Tensor) -> torch.Tensor:
+    """`points_in_boxes` of all points and boxes at once."""
+    x, y, z = (points[:, axis, None] - boxes[:, axis] for axis in range(3))
+    cos, sin = boxes[:, 6].cos(), boxes[:, 6].sin()
+    along, across = (x * cos + y * sin).abs() * 2, (y * cos - x * sin).abs() * 2
+    return (along <= boxes[:, 3]) & (across <= boxes[:, 4]) & (z.abs() * 2 <= boxes[:, 5])
+
+
+@pytest.mark.parametrize("centre", [0.0, 3e5])
+@pytest.mark.parametrize("dtypes", [(torch.float32, torch.float32), (torch.float32, torch.float64)])
+def test_points_in_boxes_part_by_part(
+    device: torch.device, centre: float, dtypes: tuple[torch.dtype, torch.dtype]
+) -> None:
+    """The same bits as all at once, at the corners too, and far away, where float32 has steps of 0.03 m."""
+    boxes = random_boxes(40, seed=4, spread=6, centre=centre).to(dtypes[1])
+    boxes[:5, 6] = 0
+    generator = torch.Generator().manual_seed(5)
+    spread = (torch.rand(MAX_PAIRS // 40 * 2 + 7, 3, generator=generator, dtype=torch.float64) - 0.5) * 16
+    spread[:, :2] += centre
+    corners = box_corners(boxes).reshape(-1, 3).double()
+    points = torch.cat((corners, spread, torch.tensor([[math.nan, 0, 0], [centre, math.inf, 0]])))
+    points, boxes = points.to(dtypes[0]).to(device), boxes.to(device)
+    expected = whole_mask(points, boxes)
+    assert (expected.sum(dim=0) > 0).all()
+    assert torch.equal(points_in_boxes(points, boxes), expected)
+    found = indices_in_boxes(points, boxes)
+    assert len(found) == 40
+    for inside, mask in zip(found, expected.T, strict=True):
+        assert torch.equal(inside, mask.nonzero()[:, 0])
+
+
+def test_indices_in_boxes() -> None:
+    """Of every box in their order; a point may be in several boxes, and a box without a size has none."""
+    boxes = torch.tensor([[0.0, 0, 0, 4, 2, 1, 0], [1, 0, 0, 4, 2, 1, math.pi / 2], [0, 0, 0, -1, -1, -1, 0]])
+    points = torch.tensor([[1.0, 1.9, 0, 9], [0.5, 0.5, 0.5, 9], [-2, 0, 0, 9], [9, 9, 9, 9], [0, 0, 0, 9]])
+    assert [inside.tolist() for inside in indices_in_boxes(points, boxes)] == [[1, 2, 4], [0, 1, 4], []]
+    assert [len(inside) for inside in indices_in_boxes(points[:0], boxes)] == [0, 0, 0]
+    assert indices_in_boxes(points, boxes[:0]) == []
 
 
 def test_boxes_collide_as_polygons_overlap() -> None:

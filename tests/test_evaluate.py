@@ -63,6 +63,60 @@ def test_frame_without_result_file(folders: list[str], tmp_path: Path, capsys: p
     assert "1 frame scored\n" in capsys.readouterr().out
 
 
+def test_files_with_a_suffix_in_capitals_are_there(folders: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    path = Path(folders[3]) / "000007.txt"
+    path.rename(path.with_suffix(".TXT"))
+    main(folders)
+    assert "2 frames scored\n" in capsys.readouterr().out
+
+
+def test_no_result_file_at_all(folders: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "empty").mkdir()
+    given = [*folders[:2], "--predictions", str(tmp_path / "empty"), "--missing-as-empty"]
+    outputs = ["--csv", str(tmp_path / "a.csv"), "--plot", str(tmp_path / "a.png")]
+    assert scored([*given, *outputs], tmp_path)["Car"]["counts"]["ground_truths"] == [2] * 3
+    printed = capsys.readouterr().out
+    assert "Car: no detections; ground truths: 2 easy, 2 moderate, 2 hard\n" in printed
+    assert "2 frames scored, 2 of them without a result file, counted as empty\n" in printed
+    given[3] = str(tmp_path / "none")
+    with pytest.raises(InputError, match="none: no such folder"):
+        main(given)
+
+
+@pytest.mark.parametrize("levels", [[], ["--no-2d-filter"], ["--distance-bands", "0-50"]])
+@pytest.mark.parametrize("side", ["label_2", "results"])
+def test_results_in_other_axes(folders: list[str], tmp_path: Path, side: str, levels: list[str]) -> None:
+    """Of bare clouds, without 2D boxes, against KITTI's labels: refused, unless the axes are said to be the same."""
+    for path in (tmp_path / side).iterdir():
+        path.write_text(path.read_text().replace("100.00 100.00 160.00 150.00", "-1 -1 -1 -1"))
+    names = re.escape(str(tmp_path / "label_2")), re.escape(str(tmp_path / "results"))
+    camera, bare = names if side == "results" else names[::-1]
+    with pytest.raises(InputError, match=f"^{camera} has 2D boxes.*; {bare} has none.*--same-axes$"):
+        main([*folders, *levels])
+    car = scored([*folders, "--same-axes", *levels], tmp_path)["Car"]
+    assert list(car["exact"]) == ["bev", "3d"]
+    kind = "detection" if side == "results" else "label"
+    assert f"2d and aos are left out: no {kind} of Car has a 2D box" in car["warnings"]
+
+
+def test_labels_with_2d_boxes_alone(folders: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for path in (tmp_path / "label_2").iterdir():
+        path.write_text(path.read_text().replace("1.50 2.00 4.00 1.00 1.60 20.00", "-1 -1 -1 -1000 -1000 -1000"))
+    outputs = ["--csv", str(tmp_path / "a.csv"), "--plot", str(tmp_path / "a.png")]
+    car = scored([*folders, "--classes", "Car", *outputs], tmp_path)["Car"]
+    assert car["exact"] == {"2d": [100] * 3, "aos": [100] * 3}
+    assert "! bev and 3d are left out: no label of Car has a 3D box\n" in capsys.readouterr().out
+
+
+def test_a_dash_has_its_reason(folders: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for path in (tmp_path / "label_2").iterdir():
+        path.write_text(path.read_text().replace("Car 0.00 0", "Car 0.00 3"))
+    main(folders)
+    printed = capsys.readouterr().out
+    assert "! 2 labels of Car count at no level: occlusion 3\n" in printed
+    assert "ground truths: 0 easy, 0 moderate, 0 hard\n! there is no label of Cyclist\n" in printed
+
+
 @pytest.mark.parametrize(
     ("name", "line", "message"),
     [
@@ -176,6 +230,40 @@ def test_classes_and_overlaps_that_are_given(
     assert "results of classes that are not scored: 1 bus, 1 Car\n" in printed
     both = scored([*given, "--overlap", "bicycle=0.25"], tmp_path)
     assert [each["overlaps"]["strict"]["3d"] for each in both.values()] == [0.5, 0.25]
+
+
+def test_names_that_count_as_a_class(folders: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """In labels and in results; the class is scored whether it is named or not."""
+    write_objects(tmp_path, ["bicycle", "Cyclist", "Van"], ["Cyclist", "bicycle", "truck"])
+    for given in (["bicycle=Cyclist"], ["Cyclist", "bicycle=Cyclist"], ["bicycle=Cyclist,truck=Cyclist", "Cyclist"]):
+        found = scored([*folders, "--classes", *given], tmp_path)
+        assert list(found) == ["Cyclist"]
+        assert found["Cyclist"]["counts"]["ground_truths"] == [2] * 3
+        assert found["Cyclist"]["counts"]["detections"] == 2 + ("," in given[0])
+        assert found["Cyclist"]["exact"]["3d"] == ([100] * 3 if "," not in given[0] else pytest.approx([200 / 3] * 3))
+    found = scored([*folders, "--classes", "Car", "Van=lorry", "truck=lorry", "--overlap", "lorry=0.5"], tmp_path)
+    assert list(found) == ["Car", "lorry"]
+    assert found["lorry"]["exact"]["3d"] == [100] * 3
+    assert "labels of classes that are not scored: 1 bicycle, 1 Cyclist\n" in capsys.readouterr().out
+    assert list(scored([*folders, "--classes", "Car", "Tram=Car"], tmp_path)) == ["Car"]  # KITTI's may be nowhere
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("=Car", "--classes =Car: want NAME=CLASS, such as bicycle=Cyclist"),
+        ("bicycle=", "--classes bicycle=: want NAME=CLASS, such as bicycle=Cyclist"),
+        ("a=b=c", "--classes a=b=c: want NAME=CLASS, such as bicycle=Cyclist"),
+        ("a=b c", "--classes a=b c: want NAME=CLASS, such as bicycle=Cyclist"),
+        ("a=b,a=c", "--classes a=c: a is given twice; leave one out"),
+        ("DontCare=Car", "--classes DontCare=Car: DontCare is a region of the image, no class"),
+        ("bycicle=Cyclist", "--classes bycicle=Cyclist: no label or result is named bycicle; there are Car, bicycle"),
+    ],
+)
+def test_bad_names(folders: list[str], tmp_path: Path, given: str, message: str) -> None:
+    write_objects(tmp_path, ["Car", "bicycle", "DontCare"], [])
+    with pytest.raises(InputError, match=f"^{re.escape(message)}$"):
+        main([*folders, "--classes", "Car", given])
 
 
 def test_what_is_not_scored_is_said_within_100_columns(

@@ -14,6 +14,7 @@ import torch
 from hvnet import evaluate
 from hvnet.config import Config, load_config
 from hvnet.data.frame import Frame, Objects
+from hvnet.data.gt_database import build_database
 from hvnet.data.kitti import KittiFrames, boxes_to_labels, frame_labels, write_labels
 from hvnet.evaluation.scoring import score
 from hvnet.exceptions import InputError, Stopped
@@ -22,7 +23,7 @@ from hvnet.pictures.clouds import Subject, draw_bev
 from hvnet.pictures.page import make_page
 from hvnet.training.batches import Data
 from hvnet.training.run import Run
-from tests.helpers import ROOT, contents
+from tests.helpers import ROOT, GivenFrames, contents
 from tests.models import TINY
 
 CLASSES = {"Truck": [7.0, 2.5, 3.0], "bicycle": [1.7, 0.6, 1.5]}
@@ -223,3 +224,11 @@ def test_kitti_is_such_a_format(scenes: Path) -> None:
     frames = KittiFrames(scenes, ["000000", "000001"])
     assert len(frames) == 2
     assert frames[1].name == frames.names[1] == "000001"
+
+
+def test_objects_that_fit_into_no_file_are_scored() -> None:
+    """A name of two words, a box of size 0: labels of a format of one's own, which no label file could hold."""
+    boxes = torch.tensor([[10.0, 0, -1, 4, 2, 1.5, 0], [20.0, 0, -1, 0, 0, 0, 0]])
+    frame = Frame("a", torch.zeros(0, 4), Objects(boxes, ["tow truck", "Car"]))
+    assert frame_labels(frame).name.tolist() == ["tow truck", "Car"]
+    assert build_database(GivenFrames(frame)).name.tolist() == ["tow truck", "Car"]

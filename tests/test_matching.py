@@ -148,10 +148,11 @@ def test_first_pass_goes_by_score_and_second_by_overlap() -> None:
 def test_boxes_without_a_size_overlap_nothing() -> None:
     rng = np.random.default_rng(0)
     truths, detections = random_frame(rng, 3, scored=False), random_frame(rng, 3, scored=True)
-    detections.dimensions[:] = -1
-    detections.bbox[:] = 5
-    candidates = find_candidates([truths], [detections])
-    assert [len(candidates.pairs[metric].overlap) for metric in METRICS] == [0, 0, 0]
+    for without in (truths, detections):  # first the labels, then both
+        without.dimensions[:] = -1
+        without.bbox[:] = 5
+        candidates = find_candidates([truths], [detections])
+        assert [len(candidates.pairs[metric].overlap) for metric in METRICS] == [0, 0, 0]
 
 
 def test_no_objects_at_all() -> None:

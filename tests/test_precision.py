@@ -208,10 +208,11 @@ def test_data_without_images() -> None:
     assert "--no-2d-filter" in car["warnings"][0]
     car = evaluate([truths], [detections], levels=LEVELS_WITHOUT_2D)["Car"]
     assert car["R40"] == {"bev": [100] * 3, "3d": [100] * 3}
-    assert car["warnings"] == []
+    left_out = "2d and aos are left out: no label and no detection of Car has a 2D box"
+    assert car["warnings"] == [left_out]
     car = evaluate([truths], [detections])["Car"]  # these levels are the default where no label has a 2D box
     assert car["R40"] == {"bev": [100] * 3, "3d": [100] * 3}
-    assert car["warnings"] == ["no label has a 2D box: the levels go by occlusion and truncation alone"]
+    assert car["warnings"] == ["no label has a 2D box: the levels go by occlusion and truncation alone", left_out]
     nothing = truths.select(np.zeros(0, np.int64))
     assert evaluate([nothing], [detections])["Car"]["report"]["false_positives"] == [len(truths) // 3] * 3
 
@@ -261,6 +262,9 @@ def test_points_are_counted_in_camera_boxes() -> None:
     points = np.zeros((9, 4), np.float32)
     points[:8, :3] = 0.99 * (box_corners(centre)[0] - centre[0, :3]) + centre[0, :3]
     assert count_points(points, labels, camera).tolist() == [8, 0]
+    labels.dimensions[0] = 0  # without a 3D box, whatever is at its place
+    points[8, :3] = 20, -3, -1.6
+    assert count_points(points, labels, camera).tolist() == [0, 0]
 
 
 @pytest.mark.parametrize(
@@ -333,6 +337,95 @@ def test_a_neighbour_that_is_scored_itself() -> None:
     assert both["Van"]["counts"]["ground_truths"] == [1] * 3
 
 
+NO_LEVEL = [
+    (["occ=3", "occ=3"], "2 labels of Car count at no level: occlusion 3"),
+    (["occ=3"], "1 label of Car counts at no level: occlusion 3"),
+    (["occ=3", "occ=4"], "2 labels of Car count at no level: occlusion above 2"),
+    (["trunc=0.6"], "1 label of Car counts at no level: truncation 0.6"),
+    (
+        ["occ=3", "trunc=1", "trunc=1 occ=3"],
+        "3 labels of Car count at no level: 2 with occlusion 3, 1 with truncation 1",
+    ),
+]
+
+
+@pytest.mark.parametrize(("keys", "reason"), NO_LEVEL)
+def test_labels_that_count_at_no_level(keys: list[str], reason: str) -> None:
+    """The table says why, with detections and without."""
+    truths = [f"Car {10 * k} 20 {100 * k} 50 {each}" for k, each in enumerate(keys)]
+    for detections in ([CAR], []):
+        car = score_cars(truths, detections)
+        assert car["exact"]["3d"] == [None] * 3
+        assert car["warnings"] == [reason]
+        assert f"\n! {reason}" in format_table({"Car": car})
+
+
+def test_labels_that_are_too_low() -> None:
+    truths = [f"Car 0 20 100 {height}" for height in (25, 20)]
+    reason = "a 2D box of at most 25 pixels in height"
+    assert score_cars(truths, [CAR])["warnings"] == [f"2 labels of Car count at no level: {reason}"]
+    reason = "easy: 0 of 2 labels of Car count: 1 with occlusion 1, 1 with a 2D box of at most 40 pixels in height"
+    assert score_cars([CAR + " occ=1", "Car 10 20 300 40"], [CAR])["warnings"][0] == reason
+
+
+def test_labels_outside_the_bands() -> None:
+    truths, detections = [rows("Car 0 30 100 50")], [rows("Car 0 30 100 50", scored=True)]
+    bands = distance_levels([(0, 20), (20, 40), (40, 60)])
+    car = evaluate(truths, detections, classes=["Car"], levels=bands)["Car"]
+    assert car["warnings"][:2] == [
+        f"{band}: 0 of 1 labels of Car count: a distance outside the band" for band in ("0-20m", "40-60m")
+    ]
+    car = evaluate(truths, detections, classes=["Car"], levels=[bands[0], bands[2]])["Car"]
+    assert car["warnings"] == ["1 label of Car counts at no level: a distance outside the bands"]
+    truths[0].dimensions[:] = -1
+    truths[0].location[:] = 0  # no place, rather than one at 0 m
+    car = evaluate(truths, detections, classes=["Car"], levels=bands)["Car"]
+    assert car["warnings"][0] == "1 label of Car counts at no level: no 3D box, hence no distance"
+    levels = [LEVELS[0]._replace(max_truncation=math.inf), LEVELS[0]._replace(max_occlusion=math.inf)]
+    car = evaluate([rows(CAR + " occ=1 trunc=0.2")], detections, classes=["Car"], levels=levels)["Car"]
+    assert car["warnings"] == ["1 label of Car counts at no level: limits that differ from level to level"]
+
+
+def test_a_class_without_labels_says_so() -> None:
+    for detections in (rows("Cyclist 0 20 100 50", scored=True), rows(scored=True)):
+        (cyclist,) = evaluate([rows(CAR)], [detections], classes=["Cyclist"]).values()
+        assert cyclist["warnings"] == ["there is no label of Cyclist"]
+        assert "! there is no label of Cyclist" in format_table({"Cyclist": cyclist})
+
+
+def test_labels_without_3d_boxes_are_scored_in_2d() -> None:
+    # Two cars, one of them found: exact 50 in 2D and, with the right alpha, in AOS.
+    truths = rows(CAR, "Car 10 20 300 50")
+    truths.dimensions[:], truths.location[:] = -1, -1000
+    detections = rows(CAR, scored=True)
+    car = evaluate([truths], [detections], classes=["Car"])["Car"]
+    assert car["exact"] == {"2d": [50] * 3, "aos": [50] * 3}
+    assert (car["report"]["metric"], car["report"]["misses"]) == ("2d", [1] * 3)
+    assert [row["ground_truths"] for row in car["report"]["recall_by_distance"].values()] == [[0] * 3] * 3
+    assert car["warnings"][0] == "bev and 3d are left out: no label of Car has a 3D box"
+    truths.alpha[0] = -10
+    car = evaluate([truths], [detections], classes=["Car"])["Car"]
+    assert car["exact"] == {"2d": [50] * 3}
+    assert car["warnings"][0] == "aos is left out: 1 of 2 labels of Car have the unknown angle -10"
+    detections.dimensions[:, 0] = 0  # a footprint without a height
+    car = evaluate([rows(CAR)], [detections], classes=["Car"])["Car"]
+    assert list(car["exact"]) == ["2d", "aos", "bev"]
+    assert car["warnings"][0] == "3d is left out: no detection of Car has a 3D box"
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_label_without_a_3d_box_among_others() -> None:
+    """As in the devkit: in 2D it is found, in BEV and 3D it is missed, and what is found there is wrong."""
+    truths, detections = rows(CAR, "Car 10 20 300 50"), rows(CAR, "Car 10 20 300 50", scored=True)
+    for size in (0, -1):
+        truths.dimensions[1], truths.location[1] = size, -1000
+        car = evaluate([truths], [detections], classes=["Car"])["Car"]
+        assert car["exact"] == {"2d": [100] * 3, "aos": [100] * 3, "bev": [25] * 3, "3d": [25] * 3}
+        assert (car["report"]["misses"], car["report"]["false_positives"]) == ([1] * 3, [1] * 3)
+        said = "1 of 2 labels of Car have no 3D box: bev and 3d count them as missed"
+        assert car["warnings"][0] == said
+
+
 @pytest.fixture(scope="module")
 def val_results() -> Path:
     root = SHARED / "kitti_val_results"
@@ -343,7 +436,7 @@ def val_results() -> Path:
 
 def test_published_detector_scores_as_in_the_devkit(val_results: Path) -> None:
     expected = json.loads((val_results / "expected.json").read_text())["Car"]
-    _, labels, predictions = read_folders(val_results / "label_2", val_results / "point_gnn_car")
+    _, labels, predictions, _ = read_folders(val_results / "label_2", val_results / "point_gnn_car")
     scored = evaluate(labels, predictions, classes=["Car"])["Car"]
     for measure, table in expected.items():
         for metric, figures in table.items():

@@ -24,6 +24,17 @@ def test_a_class_without_detections_has_one_line() -> None:
     assert format_table(result) == "Tram: no detections; ground truths: 1 easy, 1 moderate, 1 hard"
 
 
+def test_warnings_are_folded() -> None:
+    name = "a_vehicle_of_more_than_four_wheels"
+    kinds = [f"{name} 0 20 100 50 occ=3", f"{name} 0 20 100 50 trunc=0.9", f"{name} 0 20 100 10"]
+    result = evaluate([rows(*kinds)], [rows(scored=True)], classes=[name])
+    assert format_table(result).splitlines() == [
+        f"{name}: no detections; ground truths: 0 easy, 0 moderate, 0 hard",
+        f"! 3 labels of {name} count at no level: 1 with occlusion 3, 1 with",
+        "  truncation 0.9, 1 with a 2D box of at most 25 pixels in height",
+    ]
+
+
 def test_loose_overlaps_stand_where_they_differ(tmp_path: Path) -> None:
     """In the table, the curves and the plot; that of 2D boxes is the strict one."""
     result = evaluate(

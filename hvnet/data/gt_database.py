@@ -22,7 +22,7 @@ from hvnet import ranks
 from hvnet.boxes import indices_in_boxes
 from hvnet.config import DataConfig
 from hvnet.data.frame import Frames, frame_at
-from hvnet.data.kitti import KittiFrames, boxes_to_labels
+from hvnet.data.kitti import KittiFrames, box_rows
 from hvnet.data.labels import DONTCARE
 from hvnet.data.sensor import TOLERANCE, reflectance_error
 from hvnet.data.stamps import Stamps, describe_changes, find_changes, take_stamps
@@ -110,7 +110,7 @@ def build_database(frames: Frames, wanted: Sequence[int] | None = None) -> Datab
             raise InputError(f"frame {name}: {reflectance_error(highest)}")
         boxes, every = frame.objects.boxes, frame.objects.labels
         if every is None:
-            every = boxes_to_labels(boxes.double().numpy(), frame.objects.names)
+            every = box_rows(boxes.double().numpy(), frame.objects.names)
         rows = np.flatnonzero(every.name != DONTCARE)
         labels = every.select(rows)
         if frame.objects.labels is None:

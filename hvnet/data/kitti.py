@@ -459,6 +459,13 @@ def boxes_to_labels(
         _check_finite("scores", scores)
     elif (flat := (boxes[:, 3:6] <= 0).any(axis=1)).any():
         raise ValueError(f"boxes: want l, w, h above 0, got {boxes[flat.argmax(), 3:6]} in row {flat.argmax()}")
+    return box_rows(boxes, names, camera, scores)
+
+
+def box_rows(
+    boxes: NDArray[np.floating], names: Sequence[str], camera: Camera | None = None, scores: Floats | None = None
+) -> Labels:
+    """What `boxes_to_labels` returns, of objects that need not fit into a file: any name, sizes of 0."""
     bbox, visible = np.full((len(boxes), 4), -1.0), np.ones(len(boxes), dtype=np.bool_)
     if camera is not None:
         bbox, visible = camera.project_boxes(boxes)
@@ -507,7 +514,7 @@ def frame_labels(frame: Frame) -> Labels:
         raise ValueError(f"frame {frame.name}: has no labels")
     if frame.objects.labels is not None:
         return frame.objects.labels
-    return boxes_to_labels(frame.objects.boxes.double().numpy(), frame.objects.names, frame.camera)
+    return box_rows(frame.objects.boxes.double().numpy(), frame.objects.names, frame.camera)
 
 
 def _image_size(path: Path) -> tuple[int, int]:

@@ -137,16 +137,18 @@ def find_candidates(labels: Sequence[Labels], predictions: Sequence[Labels]) -> 
     return Candidates(truths, detections, detections.score, pairs, dontcare)
 
 
-def _outside(labels: Labels, level: Level) -> Mask:
+def outside(labels: Labels, level: Level) -> Mask:
+    """Which of the labels (K,) are at another distance than the level's; without a 3D box, they have none."""
+    near, far = level.distance
     distance = labels.ground_distance()
-    return (distance < level.distance[0]) | (distance >= level.distance[1])
+    return ~((distance >= near) & (distance < far)) & (level.distance != (0, math.inf))
 
 
 def select_truths(labels: Labels, name: str, level: Level) -> Mask:
     """Which of the labels (K,) are to be found. One with just the minimum of height is not."""
     height = labels.bbox[:, 3] - labels.bbox[:, 1]
     hard = (labels.occlusion > level.max_occlusion) | (labels.truncation > level.max_truncation)
-    return (labels.name == name) & ~(hard | (height <= level.min_height) | _outside(labels, level))
+    return (labels.name == name) & ~(hard | (height <= level.min_height) | outside(labels, level))
 
 
 def clean_data(
@@ -161,7 +163,7 @@ def clean_data(
     own = detections.name == name
     # the devkit counts whole pixels here, and ignores a low detection of any class: it may hide a ground truth
     height = np.trunc(np.abs(detections.bbox[:, 3] - detections.bbox[:, 1]))
-    ignored = (height < level.min_height) | (own & _outside(detections, level))
+    ignored = (height < level.min_height) | (own & outside(detections, level))
     countable = own & ~ignored
     if metric == "2d":
         countable &= candidates.dontcare <= min_overlap

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hvnet.boxes import points_in_boxes
+from hvnet.boxes import indices_in_boxes
 from hvnet.data.frame import Frame
 from hvnet.data.kitti import frame_labels
 from hvnet.data.labels import DONTCARE
@@ -58,9 +58,9 @@ def find_mistakes(frame: Frame, detections: Detections, rules: Mapping[str, Rule
     found: dict[str, list[Mistake]] = {MISS: [], FALSE_POSITIVE: []}
 
     def note(kind: str, name: str, boxes: Tensor, scores: Tensor, overlaps: Tensor) -> None:
-        points = points_in_boxes(frame.points, boxes).sum(dim=0)
+        points = [len(inside) for inside in indices_in_boxes(frame.points, boxes)]
         distances = torch.linalg.vector_norm(boxes[:, :2], dim=1)
-        rows = zip(boxes, *(column.tolist() for column in (scores, distances, points, overlaps)), strict=True)
+        rows = zip(boxes, scores.tolist(), distances.tolist(), points, overlaps.tolist(), strict=True)
         found[kind] += [Mistake(frame.name, kind, name, *row) for row in rows]
 
     for label, (name, rule) in enumerate(rules.items()):

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hvnet.boxes import points_in_boxes
+from hvnet.boxes import indices_in_boxes
 from hvnet.data.frame import Camera
 from hvnet.data.kitti import boxes_to_lidar
 from hvnet.data.labels import DONTCARE, Labels
@@ -32,6 +32,7 @@ from hvnet.evaluation.matching import (
     find_candidates,
     found_scores,
     match_at,
+    outside,
     select_truths,
 )
 from hvnet.evaluation.rules import KITTI, METRICS, Rule, rule_for
@@ -89,7 +90,8 @@ def evaluate(
             rule = rule._replace(neighbour=None)
         result[name] = _evaluate_class(candidates, name, rule, levels, score_threshold, all_points)
         result[name]["counts"]["frames"] = len(labels)
-        result[name]["warnings"] = notes + notes_of_class + result[name]["warnings"]
+        if result[name]["counts"]["detections"]:
+            result[name]["warnings"] = notes + notes_of_class + result[name]["warnings"]
     return result
 
 
@@ -103,11 +105,11 @@ def _median_length(candidates: Candidates, name: str) -> float:
 
 
 def count_points(points: NDArray[np.float32], labels: Labels, camera: Camera | None) -> Integers:
-    """How many of the points (N, 4) in LiDAR axes lie in the box of each label: (K,), 0 for DontCare."""
-    objects = labels.name != DONTCARE
+    """How many of the points (N, 4) in LiDAR axes lie in the 3D box of each label: (K,), 0 without one."""
+    objects = (labels.name != DONTCARE) & labels.has_3d()
     boxes = torch.from_numpy(boxes_to_lidar(labels.select(objects), camera))
     counts = np.zeros(len(labels), np.int64)
-    counts[objects] = points_in_boxes(torch.from_numpy(points), boxes).sum(dim=0).numpy()
+    counts[objects] = [len(inside) for inside in indices_in_boxes(torch.from_numpy(points), boxes)]
     return counts
 
 
@@ -122,7 +124,7 @@ def _evaluate_class(
     truths = candidates.truths.select(candidates.truths.name == name)
     detections = candidates.detections.select(candidates.detections.name == name)
     metrics = [metric for metric in METRICS if _has(truths, metric) and _has(detections, metric)]
-    oriented = not (detections.alpha == -10).any()  # the devkit's mark of an unknown angle
+    oriented = not (_unknown_angles(truths) or _unknown_angles(detections))
     tables: dict[str, Any] = {}
     curves: dict[str, dict[str, list[Counts]]] = {}
     for strictness, overlaps in (("strict", rule.strict), ("loose", rule.loose)):
@@ -159,7 +161,7 @@ def _evaluate_class(
         "levels": [level.name for level in levels],
         "counts": {"ground_truths": truth_counts, "detections": len(detections)},
         "report": report,
-        "warnings": _warnings(truths, detections, levels, truth_counts),
+        "warnings": _warnings(name, truths, detections, levels, truth_counts),
         "curves": curves,
     }
 
@@ -173,6 +175,11 @@ def _has(labels: Labels, metric: str) -> bool:
     else:
         given = (labels.location != -1000).all(axis=1) & (labels.dimensions > 0).all(axis=1)
     return bool(given.any()) or not len(labels)
+
+
+def _unknown_angles(labels: Labels) -> int:
+    """How many have the angle of observation -10, the devkit's mark of an unknown one."""
+    return int((labels.alpha == -10).sum())
 
 
 def _samples(matching: Matching, counts: Counts, scores: Floats) -> Integers:
@@ -254,8 +261,13 @@ def _between(values: NDArray, limits: tuple[float, float]) -> Mask:
     return (values >= limits[0]) & (values < limits[1])
 
 
-def _warnings(truths: Labels, detections: Labels, levels: Sequence[Level], counts: Sequence[int]) -> list[str]:
-    """Caveats for the reader of the figures; truths and detections are those of the class."""
+def _warnings(
+    name: str, truths: Labels, detections: Labels, levels: Sequence[Level], counts: Sequence[int]
+) -> list[str]:
+    """Caveats for the reader of the figures; truths and detections are those of the class.
+
+    Without detections there are no figures: then it is only why labels do not count.
+    """
     warnings = []
     if any(level.min_height > 0 for level in levels):
         for objects, kind in ((truths, "label"), (detections, "detection")):
@@ -265,6 +277,10 @@ def _warnings(truths: Labels, detections: Labels, levels: Sequence[Level], count
         if 0 < flat < len(truths):
             of = f"{flat} of {len(truths)} labels have"
             warnings.append(f"{of} no 2D box, as these levels ask: see hvnet.evaluate --no-2d-filter")
+    warnings += _uncounted(name, truths, levels, counts)
+    if not len(detections):
+        return warnings
+    warnings += _left_out(name, truths, detections)
     for level, total in zip(levels, counts, strict=True):
         if 0 < total <= RECALL_STEPS:
             # at most one threshold per ground truth, and the first is at recall 0
@@ -273,3 +289,65 @@ def _warnings(truths: Labels, detections: Labels, levels: Sequence[Level], count
                 f"{level.name}: {total} ground truths cap R40 at {best[0]:.2f} and R11 at {best[1]:.2f}: read 'exact'"
             )
     return warnings
+
+
+def _uncounted(name: str, truths: Labels, levels: Sequence[Level], counts: Sequence[int]) -> list[str]:
+    """Why there is nothing to find at some or all of the levels; truths are those of the class."""
+    total = len(truths)
+    if not total:
+        return [f"there is no label of {name}"]
+    if not any(counts):
+        count = f"{total} label{'s' * (total != 1)} of {name} count{'s' * (total == 1)}"
+        return [f"{count} at no level: {_reasons(truths, levels)}"]
+    empty = [level for level, count in zip(levels, counts, strict=True) if not count]
+    return [f"{level.name}: 0 of {total} labels of {name} count: {_reasons(truths, [level])}" for level in empty]
+
+
+def _reasons(truths: Labels, levels: Sequence[Level]) -> str:
+    """What keeps truths from counting at any of these levels, each by the first reason that holds for it."""
+    height = truths.bbox[:, 3] - truths.bbox[:, 1]
+    lowest = min(level.min_height for level in levels)
+    left, found = np.ones(len(truths), np.bool_), []
+
+    def note(reason: str, mask: Mask) -> None:
+        count = int((mask & left).sum())
+        left[mask] = False
+        if count:
+            found.append((reason, count))
+
+    for what, values, limit in (
+        ("occlusion", truths.occlusion, max(level.max_occlusion for level in levels)),
+        ("truncation", truths.truncation, max(level.max_truncation for level in levels)),
+    ):
+        over = (values > limit) & left
+        alike = np.unique(values[over])
+        note(f"{what} {alike[0]:g}" if len(alike) == 1 else f"{what} above {limit:g}", over)
+    note("no 2D box", (height <= lowest) & ~truths.has_2d())
+    note(f"a 2D box of at most {lowest:g} pixels in height", height <= lowest)
+    away = np.all([outside(truths, level) for level in levels], axis=0)
+    note("no 3D box, hence no distance", away & ~truths.has_3d())
+    note("a distance outside the band" + "s" * (len(levels) > 1), away)
+    note("limits that differ from level to level", left.copy())
+    if len(found) == 1:
+        return found[0][0]
+    return ", ".join(f"{count} with {reason}" for reason, count in found)
+
+
+def _left_out(name: str, truths: Labels, detections: Labels) -> list[str]:
+    """Which metrics are missing, or hard to reach, since boxes or angles are."""
+    lines = []
+    sides = {"label": truths, "detection": detections}
+    without = {metric: [f"no {kind}" for kind, rows in sides.items() if not _has(rows, metric)] for metric in METRICS}
+    if without["2d"]:
+        lines.append(f"2d and aos are left out: {' and '.join(without['2d'])} of {name} has a 2D box")
+    else:
+        for kind, rows in sides.items():
+            if unknown := _unknown_angles(rows):
+                lines.append(f"aos is left out: {unknown} of {len(rows)} {kind}s of {name} have the unknown angle -10")
+    if without["3d"]:
+        metrics = "bev and 3d are" if without["bev"] else "3d is"
+        lines.append(f"{metrics} left out: {' and '.join(without['3d'])} of {name} has a 3D box")
+    missed = int((~truths.has_3d()).sum())
+    if 0 < missed < len(truths) and not without["bev"]:
+        lines.append(f"{missed} of {len(truths)} labels of {name} have no 3D box: bev and 3d count them as missed")
+    return lines

@@ -1,6 +1,7 @@
 """The result of an evaluation in readable form: a table, the curves as CSV, and a plot of them."""
 
 import csv
+import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ def format_table(result: dict[str, dict[str, Any]]) -> str:
         if not counts["detections"]:
             totals = ", ".join(f"{total} {level}" for level, total in zip(levels, counts["ground_truths"], strict=True))
             lines[-1] = f"{name}: no detections; ground truths: {totals}"
+            lines += _warning_lines(scored["warnings"])
             continue
         lines.append("")
         side_by_side = [MEASURES] if len(levels) <= 3 else [(measure,) for measure in MEASURES]
@@ -30,9 +32,13 @@ def format_table(result: dict[str, dict[str, Any]]) -> str:
             lines.append(f"{'overlap':10}" + "  ".join([_cells(levels)] * len(measures)))
             lines += _rows(scored["overlaps"], scored, "strict", measures)
             lines += [*_rows(scored["overlaps"], scored["loose"], "loose", measures), ""]
-        lines += [f"! {warning}" for warning in scored["warnings"]] + [""] * bool(scored["warnings"])
+        lines += _warning_lines(scored["warnings"]) + [""] * bool(scored["warnings"])
         lines += [*_report_lines(scored["report"], levels), ""]
     return "\n".join(lines).rstrip()
+
+
+def _warning_lines(warnings: Sequence[str]) -> list[str]:
+    return [line for warning in warnings for line in textwrap.wrap(f"! {warning}", 100, subsequent_indent="  ")]
 
 
 def _rows(
