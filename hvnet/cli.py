@@ -37,13 +37,18 @@ def add_inputs(parser: argparse.ArgumentParser, suffixes: Sequence[str]) -> None
     )
 
 
-def add_reading(parser: argparse.ArgumentParser) -> None:
-    """The options --columns, --reflectance-scale and --classes; see `read_reading`."""
+def add_columns(parser: argparse.ArgumentParser) -> None:
+    """The option --columns."""
     parser.add_argument(
         "--columns",
         metavar="N|NAMES",
         help="the numbers of a point in .bin and .npy files: 5, or x,y,z,i,_ (i: the reflectance; default: found out)",
     )
+
+
+def add_reading(parser: argparse.ArgumentParser) -> None:
+    """The options --columns, --reflectance-scale and --classes; see `read_reading`."""
+    add_columns(parser)
     parser.add_argument(
         "--reflectance-scale",
         metavar="X|none",

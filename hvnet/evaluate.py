@@ -8,7 +8,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from hvnet.cli import add_overlaps, make_parser, read_overlaps, run_command
+from hvnet.cli import add_columns, add_overlaps, make_parser, read_overlaps, run_command
+from hvnet.data.columns import parse_columns
 from hvnet.data.kitti import TYPES
 from hvnet.data.labels import DONTCARE, Labels, class_map, count_others, rename
 from hvnet.evaluation.folders import Folders, check_axes, read_folders, read_point_counts
@@ -49,7 +50,7 @@ def choose_classes(given: Sequence[str] | None, labels: Sequence[Labels], predic
 
 
 def read_classes(given: Sequence[str] | None) -> tuple[list[str] | None, dict[str, str]]:
-    """The classes of --classes, None if it is not given, and the names that count as one of them.
+    """The classes of --classes, None if it names none, and the names that count as one of them.
 
     Raises InputError for a mapping that means nothing.
     """
@@ -57,7 +58,7 @@ def read_classes(given: Sequence[str] | None) -> tuple[list[str] | None, dict[st
         return None, {}
     renamed = class_map([text for text in given if "=" in text])
     bare = [text for text in given if "=" not in text]
-    return list(dict.fromkeys([*bare, *renamed.values()])), renamed
+    return list(dict.fromkeys([*bare, *renamed.values()])) if bare else None, renamed
 
 
 def rename_all(folders: Folders, renamed: Mapping[str, str]) -> Folders:
@@ -99,8 +100,8 @@ def main(argv: Sequence[str] | None) -> None:
         "--classes",
         nargs="+",
         metavar="CLASS",
-        help="to score (default: Car, Pedestrian and Cyclist, and every class that KITTI does not know); NAME=CLASS: "
-        "labels and results of this name count as this class, which is scored, such as bicycle=Cyclist",
+        help="to score (default: Car, Pedestrian and Cyclist, and every class that KITTI does not know); "
+        "bicycle=Cyclist: labels and results of this name count as this class, which is scored",
     )
     add_overlaps(parser)
     parser.add_argument(
@@ -130,6 +131,7 @@ def main(argv: Sequence[str] | None) -> None:
         metavar="DIR",
         help="folder with velodyne/ and calib/ (none without a camera): adds the recall by number of points in the box",
     )
+    add_columns(parser)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write the precision-recall curves")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw these curves (.png, .pdf, .svg)")
@@ -148,7 +150,8 @@ def main(argv: Sequence[str] | None) -> None:
     frames, labels, predictions, missing = rename_all(folders, renamed)
     classes = choose_classes(given, labels, predictions)
     overlaps = read_overlaps(args.overlap, classes)
-    points = read_point_counts(args.clouds, frames, labels) if args.clouds else None
+    columns = parse_columns(args.columns) if args.columns is not None else ()
+    points = read_point_counts(args.clouds, frames, labels, columns) if args.clouds else None
     result = evaluate(
         labels,
         predictions,

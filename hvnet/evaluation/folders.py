@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 from tqdm import tqdm
 
-from hvnet.data.kitti import drop_non_finite, find_file, frame_camera, read_labels, read_points
+from hvnet.data.clouds import judge, read_raw
+from hvnet.data.kitti import find_file, frame_camera, read_labels
 from hvnet.data.labels import DONTCARE, Labels, no_results
 from hvnet.evaluation.matching import Integers
 from hvnet.evaluation.precision import count_points
@@ -112,10 +113,15 @@ def _read_frames(path: Path, label_files: dict[str, Path], label_dir: Path) -> l
     return list(seen)
 
 
-def read_point_counts(folder: Path, frames: Sequence[str], labels: Sequence[Labels]) -> list[Integers]:
-    """The points (K,) in the boxes of every frame's labels, of the clouds of a folder with velodyne/ and calib/."""
+def read_point_counts(
+    folder: Path, frames: Sequence[str], labels: Sequence[Labels], columns: Sequence[str] = ()
+) -> list[Integers]:
+    """The points (K,) in the boxes of every frame's labels, of the clouds of a folder with velodyne/ and calib/.
+
+    columns: the numbers of a point; they are found out if none are given.
+    """
     counts = []
     for frame, label in zip(tqdm(frames, "counting points", disable=None, leave=False), labels, strict=True):
-        points, _ = drop_non_finite(read_points(find_file(folder / "velodyne", frame, ".bin")))
-        counts.append(count_points(points, label, frame_camera(folder, frame, label)))
+        raw = read_raw(find_file(folder / "velodyne", frame, ".bin"), columns)
+        counts.append(count_points(judge(raw, 1.0).points, label, frame_camera(folder, frame, label)))
     return counts
