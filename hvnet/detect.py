@@ -124,7 +124,6 @@ def detect(
     for the KITTI server, and submission.zip is written last.
     """
     total, truths, looks, reflectances = 0, {}, [], []
-    point_range = detector.config.encoder.point_range
     bar = tqdm(range(len(frames)), desc="detecting", unit="cloud", dynamic_ncols=True)
     for k, frame, found, every in detect_frames(detector, frames, bar, seen):
         (out / "results").mkdir(parents=True, exist_ok=True)  # not before the first cloud is read
@@ -146,7 +145,7 @@ def detect(
             with_image = frame.camera is not None and frame.camera.image is not None
             picture = draw_frame if with_image else draw_bev
             subject = Subject(frame, found, detector.classes)
-            picture(out / "pictures" / f"{frame.name}.png", subject, point_range, frame.name)
+            picture(out / "pictures" / f"{frame.name}.png", subject, detector.seen_range(look.shift), frame.name)
         if frame.objects is not None:
             truths[frame.name] = frame_labels(frame)
         total += len(found.boxes)

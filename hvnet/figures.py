@@ -35,10 +35,10 @@ from hvnet.pictures.clouds import FORMATS, Colour, Subject, draw_bev, draw_frame
 from hvnet.pictures.features import draw_features, features_of
 
 
-def draw(frame: Frame, found: Detections, detector: Detector, path: Path, colour: Colour) -> None:
-    """Writes the figure of a frame with its labels, if it has any, and detections."""
+def draw(frame: Frame, found: Detections, detector: Detector, shift: float, path: Path, colour: Colour) -> None:
+    """Writes the figure of a frame, seen raised by `shift` metres, with its labels, if it has any, and detections."""
     picture = draw_bev if frame.camera is None else draw_frame
-    picture(path, Subject(frame, found, detector.classes), detector.config.encoder.point_range, frame.name, colour)
+    picture(path, Subject(frame, found, detector.classes), detector.seen_range(shift), frame.name, colour)
 
 
 def main(arguments: Sequence[str] | None) -> None:
@@ -91,9 +91,9 @@ def main(arguments: Sequence[str] | None) -> None:
     bar = tqdm(range(len(frames)), desc="drawing", unit="cloud", dynamic_ncols=True)
     looks, reflectances = [], []
     for _, frame, found, _ in detect_frames(detector, frames, bar):
-        looks.append(look_at(detector, frame))
+        looks.append(look := look_at(detector, frame))
         reflectances.append(frame.reflectance)
-        draw(frame, found, detector, options.out / f"{frame.name}.{options.format}", options.colour)
+        draw(frame, found, detector, look.shift, options.out / f"{frame.name}.{options.format}", options.colour)
         if options.features:
             features = [features_of(each, each.place(frame.points).clouds[0], name) for each, name in models]
             draw_features(options.out / f"{frame.name}-features.{options.format}", features, frame.name)

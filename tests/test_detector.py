@@ -408,3 +408,13 @@ def test_points_of_any_array(demo: Config) -> None:
     bright[:, 3] *= 255
     with pytest.raises(ValueError, match=r"want a reflectance from 0 to 1, got 2\d\d"):
         detector(bright)
+
+
+@pytest.mark.parametrize(("options", "shift", "seen"), [
+    ({}, 0.0, (0, -32, -3, 64, 32, 2)),
+    ({}, -1.5, (0, -32, -1.5, 64, 32, 3.5)),
+    ({"turn": -90.0}, 0.0, (-32, 0, -3, 32, 64, 2)),
+    ({"all_round": True}, 1.0, (-64, -64, -4, 64, 64, 1)),
+])  # fmt: skip
+def test_seen_range(options: dict, shift: float, seen: tuple[float, ...]) -> None:
+    assert load(device="cpu", **options).seen_range(shift) == pytest.approx(seen, abs=1e-9)

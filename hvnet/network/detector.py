@@ -165,6 +165,18 @@ class Detector:
         reason = range_reason(placed.clouds[0].cpu(), point_range) if count <= FEW_IN_RANGE * len(seen) else ""
         return Look(len(seen), count, float(placed.ground), float(placed.shift), reason)
 
+    def seen_range(self, shift: float = 0.0) -> tuple[float, ...]:
+        """x_min, y_min, z_min, x_max, y_max, z_max around all that is seen of a cloud that is raised by `shift` metres,
+        in its own axes."""
+        point_range = self.config.encoder.point_range
+        x_min, y_min, z_min, x_max, y_max, z_max = point_range
+        if self.turns == [0.0]:
+            return x_min, y_min, z_min - shift, x_max, y_max, z_max - shift
+        corners = torch.tensor([[x_min, y_min], [x_min, y_max], [x_max, y_min], [x_max, y_max]], dtype=torch.float64)
+        around = torch.cat([turned(corners, -angle) for angle in self.turns])
+        low, high = around.amin(dim=0).tolist(), around.amax(dim=0).tolist()
+        return *low, z_min - shift, *high, z_max - shift
+
     def take_back(self, found: Sequence[Detections], shift: float) -> Detections:
         """The boxes of a cloud, found in every direction, in its own axes: those straight ahead, joined by NMS."""
         if len(self.turns) == 1 and not self.turns[0] and not shift:

@@ -92,7 +92,7 @@ def show_bev(axes: Axes, subject: Subject, point_range: Sequence[float], colour:
     points = subject.frame.points.cpu()
     inside = (points[:, 0] >= x_min) & (points[:, 0] < x_max) & (points[:, 1] >= y_min) & (points[:, 1] < y_max)
     x, y, z, reflectance = points[inside].numpy().T
-    values, limits = (z, (z_min, min(z_max, 1.0))) if colour == "height" else (reflectance, (0.0, 1.0))
+    values, limits = (z, (z_min, min(z_max, z_min + 4))) if colour == "height" else (reflectance, (0.0, 1.0))
     scattered = _scatter(axes, -y, x, values, limits, "cividis_r", 70 / (x_max - x_min + y_max - y_min))
     _rings(axes, point_range)
     for boxes, texts, tint, width, label in _groups(subject, point_range):

@@ -297,8 +297,8 @@ class Viewer:
         with self.lock:
             points, chosen = self.frame.points, self.colour.value
             if chosen == "height":
-                z_min, z_max = self.detector.config.encoder.point_range[2::3]
-                colours = shades(points[:, 2].numpy(), z_min, min(z_max, 1.0))
+                z_min, z_max = self.detector.seen_range(self.look.shift)[2::3]
+                colours = shades(points[:, 2].numpy(), z_min, min(z_max, z_min + 4))
             elif chosen == "reflectance":
                 colours = shades(points[:, 3].numpy(), 0, REFLECTANCE)
             else:
