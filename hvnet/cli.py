@@ -59,7 +59,7 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=CLASS",
-        help="labels of this name count as a class of the detector, such as bicycle=Cyclist",
+        help="labels of this name count as a class of the detector, such as bicycle=Cyclist; several with commas",
     )
 
 
@@ -91,12 +91,12 @@ def of_labels(config: Config) -> DataConfig:
     return DataConfig(classes=config.data.classes)
 
 
-def add_sensor_height(parser: argparse.ArgumentParser) -> None:
-    """The option --sensor-height; see `read_sensor_height`."""
+def add_sensor_height(parser: argparse.ArgumentParser, what: str) -> None:
+    """The option --sensor-height, what it does in a few words; see `read_sensor_height`."""
     parser.add_argument(
         "--sensor-height",
         metavar="METRES",
-        help="of the LiDAR above the road; none: clouds stay where they are (default: found from the ground)",
+        help=f"of the LiDAR above the road{what} (default: found from the ground)",
     )
 
 
@@ -113,7 +113,7 @@ def read_sensor_height(options: argparse.Namespace) -> float | Literal["none"] |
 
 def add_mount(parser: argparse.ArgumentParser) -> None:
     """The options --sensor-height, --turn and --all-round; see `read_mount`."""
-    add_sensor_height(parser)
+    add_sensor_height(parser, "; none: clouds stay where they are")
     parser.add_argument(
         "--turn",
         default="0",

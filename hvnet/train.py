@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None) -> None:
     parser.add_argument("--out", metavar="DIR", help="folder of the run (default: runs/NAME of the config)")
     parser.add_argument("--resume", action="store_true", help="continue the run in --out (default: the latest)")
     add_reading(parser)
-    add_sensor_height(parser)
+    add_sensor_height(parser, ", which the checkpoint keeps")
     add_device(parser)
     add_changes(parser, "override a config value, such as train.epochs=3")
     options = parser.parse_args(arguments)

@@ -636,3 +636,15 @@ def test_all_round_takes_the_whole_cloud(tmp_path: Path, kitti_root: Path) -> No
 def test_options_that_mean_nothing(options: tuple[str, str], said: str, checkpoint: Path, scenes: Path) -> None:
     with pytest.raises(InputError, match=re.escape(said)):
         detect(checkpoint, scenes / "never", scenes, options=(f"{options[0]}={options[1]}",))
+
+
+def test_labels_whose_boxes_are_not_finite(
+    checkpoint: Path, copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Numbers that a label file may hold and a float32 may not."""
+    path = copied / "training" / "label_2" / "000001.txt"
+    path.write_text("Car 0 0 0 100 100 200 200 1.5 1.6 4 1e39 1.7 20 0\n")
+    detect(checkpoint, tmp_path / "out", copied)
+    printed = printed_by(capsys)
+    assert f"{path}: boxes: want finite numbers" in printed
+    assert "5 of 6 frames are scored; no labels: 000001" in printed

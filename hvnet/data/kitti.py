@@ -86,7 +86,10 @@ class KittiFrames:
             try:
                 objects = Objects(boxes, rows.name.tolist(), labels)
             except ValueError as error:
-                raise InputError(f"{find_file(self.folder / 'label_2', name, '.txt')}: {error}") from error
+                wrong = f"{find_file(self.folder / 'label_2', name, '.txt')}: {error}"
+                if self.labelled:
+                    raise InputError(wrong) from error
+                notes.append(f"{wrong}; the frame counts as not labelled")
         return Frame(name, torch.from_numpy(points), objects, camera, notes, cloud.reflectance.fact, in_view)
 
     def labels(self, k: int) -> tuple[Labels | None, str]:
