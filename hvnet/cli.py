@@ -9,12 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from hvnet.config import Config, DataConfig
+from hvnet.config import DataConfig
 from hvnet.data.columns import parse_columns
 from hvnet.data.labels import class_map
 from hvnet.exceptions import InputError, Stopped
 
-MAX_SENSOR_HEIGHT = 100.0  # metres
+MAX_SENSOR_HEIGHT = 1000.0  # metres; below 0 where heights are those of a map
 
 
 def make_parser(command: str, description: str, examples: Sequence[str]) -> argparse.ArgumentParser:
@@ -86,11 +86,6 @@ def read_reading(
     return replace(given or DataConfig(), **changes)
 
 
-def of_labels(config: Config) -> DataConfig:
-    """How the labels of a config's data are read; other clouds than those may be of another sensor."""
-    return DataConfig(classes=config.data.classes)
-
-
 def add_sensor_height(parser: argparse.ArgumentParser, what: str) -> None:
     """The option --sensor-height, what it does in a few words; see `read_sensor_height`."""
     parser.add_argument(
@@ -106,8 +101,8 @@ def read_sensor_height(options: argparse.Namespace) -> float | Literal["none"] |
     if text is None or text == "none":
         return text
     height = _number(text)
-    if not 0 <= height <= MAX_SENSOR_HEIGHT:
-        raise InputError(f"--sensor-height {text}: want metres from 0 to {MAX_SENSOR_HEIGHT:g}, or none")
+    if not abs(height) <= MAX_SENSOR_HEIGHT:
+        raise InputError(f"--sensor-height {text}: want metres, {MAX_SENSOR_HEIGHT:g} at most, or none")
     return height
 
 

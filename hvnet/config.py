@@ -414,6 +414,7 @@ def _check(config: Config, source: str) -> None:
              "between 0 and positive_iou", entry.negative_iou)  # fmt: skip
     for name, meant in config.data.classes.items():
         want(meant in names, f"data.classes.{name}", f"a class of head.classes ({', '.join(names)})", meant)
+        want(name != "DontCare", f"data.classes.{name}", "the name of objects, which are regions here", name)
     for name, count in config.augment.objects.items():
         wanted = f"a class of head.classes ({', '.join(names)}; rename or remove it)"
         want(name in names, f"augment.objects.{name}", wanted, name)

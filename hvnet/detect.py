@@ -22,7 +22,6 @@ from hvnet.cli import (
     add_overlaps,
     add_reading,
     make_parser,
-    of_labels,
     read_mount,
     read_overlaps,
     read_reading,
@@ -213,7 +212,7 @@ def main(arguments: Sequence[str] | None) -> None:
         raise InputError("--partial: is for --split test")
     submit = options.split == "test" and not options.partial
     detector = load(options.checkpoint, options.device, **read_mount(options))
-    reading = read_reading(options, of_labels(detector.config), detector.classes)
+    reading = read_reading(options, detector.config.data, detector.classes)
     # looking all round wants the whole cloud, not what a camera sees
     frames = find_frames(options.inputs, options.split, reading, crop=not options.all_round)
     roots = [part for part in frames.parts if isinstance(part, KittiFrames)]

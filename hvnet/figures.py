@@ -17,7 +17,6 @@ from hvnet.cli import (
     add_mount,
     add_reading,
     make_parser,
-    of_labels,
     read_mount,
     read_reading,
     run_command,
@@ -76,14 +75,14 @@ def main(arguments: Sequence[str] | None) -> None:
     if options.compare and not options.features:
         raise InputError("--compare: is for --features; give both")
     detector = load(options.checkpoint, options.device, **read_mount(options))
-    reading = read_reading(options, of_labels(detector.config), detector.classes)
+    reading = read_reading(options, detector.config.data, detector.classes)
     frames = find_frames(options.inputs, options.split, reading, crop=not options.all_round)
     if options.features and (clash := set(frames.names) & {f"{name}-features" for name in frames.names}):
         name = min(clash)
         raise InputError(f"{name}: has the name of the features of {name.removesuffix('-features')}; rename one")
     models = [(detector, options.checkpoint.stem if options.checkpoint else "shipped weights")]
     if options.compare:
-        models.append((load(options.compare, options.device), options.compare.stem))
+        models.append((load(options.compare, options.device, **read_mount(options)), options.compare.stem))
         if models[0][1] == models[1][1]:  # runs/a/checkpoint.pt and runs/b/checkpoint.pt
             models = [
                 (each, str(path)) for (each, _), path in zip(models, (options.checkpoint, options.compare), strict=True)

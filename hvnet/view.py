@@ -13,7 +13,6 @@ from hvnet.cli import (
     add_overlaps,
     add_reading,
     make_parser,
-    of_labels,
     read_mount,
     read_overlaps,
     read_reading,
@@ -87,8 +86,7 @@ def main(arguments: Sequence[str] | None) -> None:
             data = Path(folder)
             distance = (4.0, min(detector.config.encoder.point_range[3] - 2, 80.0))
             generate(data, 0, DEMO_FRAMES, seed=1, options=Options(distance=distance))
-        given = detector.config.data if data != options.input else of_labels(detector.config)  # of a run, or another
-        reading = read_reading(options, given, detector.classes)
+        reading = read_reading(options, detector.config.data, detector.classes)
         frames = find_frames([data], options.split, reading, crop=not options.all_round)
         rules = config_rules(detector.config, read_overlaps(options.overlap, detector.classes))
         server = start_server(options.host, options.port)

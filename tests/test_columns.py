@@ -131,3 +131,31 @@ def test_real_files() -> None:
 def test_every_kitti_cloud_has_four(kitti_root: Path) -> None:
     for file in sorted((kitti_root / "training" / "velodyne").glob("*.bin")):
         assert find_layout(file.read_bytes()) == FOUR, file
+
+
+def test_float64_with_one_full_column() -> None:
+    """Such as times: five of six lower halves are zero."""
+    times = np.linspace(1.5e9, 1.5e9 + 0.1, 600)[:, None]
+    points = np.concatenate((scan().astype(np.float16), scan()[:, :1].round(), times), axis=1).astype("<f8")
+    for columns in ((), COUNTS[6]):
+        numbers, layout = read_numbers(points.tobytes(), PATH, columns)
+        assert layout == Layout(COUNTS[6], "<f8")
+        np.testing.assert_array_equal(numbers, points)
+
+
+@pytest.mark.parametrize("content", [
+    np.random.default_rng(0).bytes(16000),
+    (b"1.0 2.0 3.0 0.5\n" * 1000),
+    np.random.default_rng(0).integers(-60_000, 60_000, (1000, 4)).astype("<i4").tobytes(),
+])  # fmt: skip
+def test_files_that_are_no_clouds(content: bytes) -> None:
+    assert len(content) % 16 == 0
+    with pytest.raises(
+        InputError, match=r"cloud\.bin: its numbers, as 4 numbers a point, are no coordinates in metres; "
+    ):
+        read_numbers(content, PATH)
+
+
+def test_few_points_of_another_type_by_their_columns() -> None:
+    data = scan(20).astype("<f2").tobytes() + scan(3).astype("<f2").tobytes()
+    assert read_numbers(data, PATH, COUNTS[4])[1] == Layout(COUNTS[4], "<f2")

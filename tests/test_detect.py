@@ -627,7 +627,7 @@ def test_all_round_takes_the_whole_cloud(tmp_path: Path, kitti_root: Path) -> No
     (("--reflectance-scale", "0"), "--reflectance-scale 0: want a number above 0, or none"),
     (("--reflectance-scale", "nan"), "--reflectance-scale nan: want"),
     (("--reflectance-scale", "bright"), "--reflectance-scale bright: want"),
-    (("--sensor-height", "-2"), "--sensor-height -2: want metres from 0 to 100, or none"),
+    (("--sensor-height", "-2000"), "--sensor-height -2000: want metres, 1000 at most, or none"),
     (("--sensor-height", "high"), "--sensor-height high: want metres"),
     (("--turn", "left"), "--turn left: want degrees from -360 to 360"),
     (("--turn", "nan"), "--turn nan: want degrees"),

@@ -15,8 +15,9 @@ from hvnet.data.kitti import read_frame
 from hvnet.exceptions import InputError
 from hvnet.kernels.rotated import rotated_iou_bev
 from hvnet.network.anchors import MAX_HEIGHT, MAX_SIZE
-from hvnet.network.checkpoint import save_checkpoint
+from hvnet.network.checkpoint import load_checkpoint, save_checkpoint
 from hvnet.network.detector import (
+    SHIPPED,
     Detector,
     fold_batch_norms,
     load,
@@ -418,3 +419,43 @@ def test_points_of_any_array(demo: Config) -> None:
 ])  # fmt: skip
 def test_seen_range(options: dict, shift: float, seen: tuple[float, ...]) -> None:
     assert load(device="cpu", **options).seen_range(shift) == pytest.approx(seen, abs=1e-9)
+
+
+def test_nothing_is_lost_between_two_looks(street: Tensor) -> None:
+    """Every sure car is found wherever it lies, on the border of two looks too."""
+    sure = load(device="cpu")(street)
+    sure = sure.select((sure.scores > 0.6) & (sure.labels == 0))
+    assert len(sure.boxes) >= 3
+    for box in sure.boxes:
+        azimuth = math.degrees(math.atan2(box[1], box[0]))
+        for beside in (-1.0, 0.0, 1.0):
+            detector = load(device="cpu", all_round=True, turn=45 - azimuth + beside)
+            found = detector(street)
+            assert rotated_iou_bev(box[None], found.boxes[found.labels == 0]).max() > 0.5, (azimuth, beside)
+
+
+@pytest.mark.parametrize("options", [
+    {"sensor_height": math.nan}, {"sensor_height": "1.7"}, {"sensor_height": None}, {"sensor_height": True},
+    {"turn": math.nan}, {"turn": "90"}, {"turn": None},
+])  # fmt: skip
+def test_options_that_are_no_numbers(options: dict) -> None:
+    with pytest.raises(ValueError, match=f"^{next(iter(options))}: want "):
+        load(device="cpu", **options)
+
+
+@pytest.mark.parametrize("facts", [None, [1.0], {"ground": "x"}, {"ground": math.nan}, {"reflectance_scale": "255"}])
+def test_damaged_facts_on_the_sensor(facts: object, tmp_path: Path) -> None:
+    content = load_checkpoint(SHIPPED) | {"sensor": facts}
+    save_checkpoint(tmp_path / "damaged.pt", content)
+    with pytest.raises(InputError, match=r"damaged\.pt: its facts on the sensor are damaged"):
+        load(tmp_path / "damaged.pt", "cpu")
+
+
+def test_a_checkpoint_without_facts_on_the_sensor(tmp_path: Path, street: Tensor) -> None:
+    """As version 0.1.0 wrote it: nothing is moved, and a height that would mean nothing is refused."""
+    content = load_checkpoint(SHIPPED)
+    del content["sensor"]
+    save_checkpoint(tmp_path / "old.pt", content)
+    assert load(tmp_path / "old.pt", "cpu").look(street + torch.tensor([0, 0, 1.33, 0])).shift == 0
+    with pytest.raises(InputError, match=r"old\.pt: does not know the ground of its training data"):
+        load(tmp_path / "old.pt", "cpu", sensor_height=1.8)

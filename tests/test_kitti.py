@@ -3,6 +3,7 @@
 import math
 import re
 import shutil
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -687,3 +688,19 @@ def test_points_of_any_number(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_points(tmp_path / "a.bin")[:, 0], [1, np.nan, np.inf])
     write_points(tmp_path / "b.bin", np.array([[1, 2, 3, 0]] * 3))
     assert read_points(tmp_path / "b.bin").tolist() == [[1, 2, 3, 0]] * 3
+
+
+@pytest.mark.parametrize("occlusion", ["1e30", "-1e30", "0.5"])
+def test_an_occlusion_that_no_whole_number_holds(tmp_path: Path, occlusion: str) -> None:
+    path = tmp_path / "000000.txt"
+    path.write_text(CAR.replace(" 1 ", f" {occlusion} ", 1) + "\n")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(InputError, match=f":1: field 3 is '{occlusion}', not a whole number"):
+            read_labels(path)
+
+
+@pytest.mark.parametrize("name", ["Car\n", " Car", "two words", ""])
+def test_a_name_that_a_file_would_not_give_back(name: str) -> None:
+    with pytest.raises(ValueError, match="names: want classes of one word each"):
+        boxes_to_labels(np.array([[10.0, 0, 0, 4, 2, 1.5, 0]]), [name])

@@ -136,7 +136,6 @@ def test_reflectance_of_arrays() -> None:
     same = points.clone()
     same[:, 3] = 0.5
     assert (as_points(same)[:, 3] == 0).all()
-    assert as_points(same[:9]) is not None
     assert (as_points(same[:9])[:, 3] == 0.5).all()  # too few to tell
 
 
@@ -171,6 +170,8 @@ def test_the_ground_of_a_sensor_high_up() -> None:
     street()[:20],
     torch.rand(3000, 4, generator=torch.Generator().manual_seed(0)) * torch.tensor([60.0, 60, 40, 1]) - 30,  # anywhere
     street() + 1e6,
+    street(3.0)[:400],  # little, and above the sensor
+    torch.cat((street(4.0), street(-1.7)[:3000] * torch.tensor([0.1, 0.1, 1, 1]))),  # a ceiling; the floor is near
 ])  # fmt: skip
 def test_no_ground(points: Tensor) -> None:
     assert math.isnan(ground_height(points))
@@ -218,8 +219,9 @@ def test_inside() -> None:
 @pytest.mark.parametrize(("change", "said"), [
     (lambda p: p + torch.tensor([4.5e5, 5.4e6, 110, 0]), r"they lie around 450\d\d\d, 5400\d\d\d, 10\d, as map coord"),
     (lambda p: p * 1000, "as in millimetres; metres are wanted"),
+    (lambda p: p + torch.tensor([100.0, 0, 0, 0]), "they are further from the sensor than 64 m"),
     (lambda p: p * 100, "as in centimetres; metres are wanted"),
-    (lambda p: p + torch.tensor([0, 0, 30.0, 0]), "their heights are .* m; give --sensor-height"),
+    (lambda p: p + torch.tensor([0, 0, 30.0, 0]), r"their heights .* are .* m, -3 to 2 m are seen; give"),
     (lambda p: p * torch.tensor([0, 1, 1, 1]) - torch.tensor([20.0, 0, 0, 0]), "behind or beside the sensor; --turn"),
     (lambda p: p[:0], "the cloud has no points"),
     (lambda p: p * torch.nan, "the cloud has no points"),

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hvnet.data.frame import object_names
+from hvnet.data.frame import Frames, object_names
 from hvnet.data.kitti import read_points
 from hvnet.data.sources import CloudFiles, JoinedFrames, find_frames
 from hvnet.exceptions import InputError
@@ -147,3 +147,60 @@ def test_joined_frames(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"missing\.npy: cannot be read"):
         joined[2]
     assert len(JoinedFrames([])) == 0
+
+
+# --- the scale of the reflectance ------------------------------------------------------------------------------------
+
+
+def a_cloud(count: int, highest: float, seed: int = 0) -> np.ndarray:
+    points = np.random.default_rng(seed).uniform(-20, 20, (count, 4))
+    points[:, 3] = np.linspace(0, highest, count)
+    return points.astype(np.float32)
+
+
+def brightest(frames: Frames) -> list[float]:
+    return [float(frames[k].points[:, 3].max()) for k in range(len(frames))]
+
+
+def test_one_sensor_has_one_scale(tmp_path: Path) -> None:
+    """However dark a cloud is; files of another kind, or in another folder, are another sensor's."""
+    for name, highest in (("a", 60000.0), ("b", 200.0), ("c", 0.9)):
+        np.save(tmp_path / f"{name}.npy", a_cloud(500, highest))
+    (tmp_path / "other").mkdir()
+    np.save(tmp_path / "other" / "d.npy", a_cloud(500, 255.0))
+    (tmp_path / "e.bin").write_bytes(a_cloud(500, 1.0).tobytes())
+    frames = find_frames([tmp_path, tmp_path / "other"])
+    wanted = {"a": 60000 / 65535, "b": 200 / 65535, "c": 0.9 / 65535, "d": 1.0, "e": 1.0}
+    assert dict(zip(frames.names, brightest(frames), strict=True)) == pytest.approx(wanted, rel=1e-5)
+
+
+def test_a_small_file_with_an_outlier_changes_no_other(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", a_cloud(500, 1.0))
+    small = a_cloud(15, 1.0)
+    small[7, 3] = 1e30
+    np.save(tmp_path / "b.npy", small)
+    assert brightest(find_frames([tmp_path])) == [1.0, 1.0]
+    assert brightest(find_frames([tmp_path / "b.npy"])) == [1.0]
+
+
+def test_paths_of_any_kind_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    np.save(tmp_path / "a.npy", a_cloud(500, 255.0))
+    (tmp_path / "there").mkdir()
+    np.save(tmp_path / "there" / "b.npy", a_cloud(500, 255.0))
+    monkeypatch.chdir(tmp_path)
+    frames = find_frames([Path("a.npy"), tmp_path / "there" / "b.npy"])
+    notes = [frames[k].notes for k in range(2)]
+    assert notes == [["a.npy: reflectance was divided by 255"],
+                     [f"{tmp_path / 'there' / 'b.npy'}: reflectance was divided by 255"]]  # fmt: skip
+
+
+def test_beams_without_an_echo(tmp_path: Path) -> None:
+    points = a_cloud(500, 1.0)
+    points[100:300, :3] = 0
+    np.save(tmp_path / "a.npy", points)
+    frame = find_frames([tmp_path / "a.npy"])[0]
+    assert len(frame.points) == 300
+    assert frame.notes == [f"{tmp_path / 'a.npy'}: 200 points at 0, 0, 0, where no echo came back, were dropped"]
+    points[100:291, :3] = 1
+    np.save(tmp_path / "a.npy", points)
+    assert len(find_frames([tmp_path / "a.npy"])[0].points) == 500  # nine points may be anything

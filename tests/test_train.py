@@ -679,3 +679,13 @@ def test_folders_are_numbered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert choose_out("runs/demo-2", config, resume=True) == Path("runs/demo-2")
     with pytest.raises(InputError, match=r"demo-2: is not empty"):
         choose_out("runs/demo-2", config, resume=False)
+
+
+def test_a_run_that_is_not_resumed_leaves_the_database(copied: Path, tmp_path: Path) -> None:
+    """Its config is looked at before the database is built again for other options."""
+    database = copied / "gt_database.npz"
+    run(copied, tmp_path / "run", "augment.objects={Car: 2}")
+    before = database.read_bytes()
+    with pytest.raises(InputError, match=r"was trained with another data\.reflectance_scale"):
+        run(copied, tmp_path / "run", "augment.objects={Car: 2}", "data.reflectance_scale=255", resume=True)
+    assert database.read_bytes() == before

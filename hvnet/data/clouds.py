@@ -28,6 +28,10 @@ from hvnet.exceptions import InputError
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
 SAMPLED_FILES = 16
 """Files of a folder, or of a call, that tell the scale of the reflectance."""
+SAMPLED_POINTS = 20_000
+"""... and points of each."""
+NO_ECHO = 10
+"""From so many points at 0, 0, 0 on they are beams without an echo."""
 
 
 class RawCloud(NamedTuple):
@@ -44,7 +48,7 @@ class Cloud(NamedTuple):
 
     points: Floats  # (N, 4) x, y, z in metres, finite; reflectance in [0, 1]
     reflectance: Reflectance
-    dropped: int  # points that were not finite
+    notes: list[str]  # on points that were dropped
 
 
 def is_cloud(path: Path) -> bool:
@@ -60,9 +64,8 @@ def read_cloud(path: Path, reading: DataConfig | None = None) -> tuple[Floats, l
     """
     raw = read_raw(path, () if reading is None else reading.columns)
     cloud = judge(raw, find_scale([raw], reading))
-    notes = [dropped_note(cloud.dropped)] if cloud.dropped else []
     note = cloud.reflectance.note.replace("reflectance was", f"reflectance up to {cloud.reflectance.highest:g} was")
-    notes += [text for text in (raw.note, note) if text]
+    notes = cloud.notes + [text for text in (raw.note, note) if text]
     return cloud.points, [f"{path}: {note}" for note in notes]
 
 
@@ -74,8 +77,9 @@ def read_raw(path: Path, columns: Sequence[str] = ()) -> RawCloud:
     suffix = path.suffix.lower()
     if suffix == ".bin":
         rows, layout = read_numbers(_read_bytes(path), path, columns)
-        found = layout != FOUR and not columns
-        note = f"read as {layout}: {', '.join(layout.names)}; --columns says otherwise" if found else ""
+        found = layout.dtype != FOUR.dtype if columns else layout != FOUR
+        note = f"read as {layout}: {', '.join(layout.names)}" + "; --columns says otherwise" * (not columns)
+        note = note if found else ""
         return _raw({name: rows[:, k] for k, name in enumerate(layout.names) if name != "_"}, str(layout), note)
     if suffix == ".npy":
         return _read_npy(path, columns)
@@ -89,23 +93,29 @@ def find_scale(clouds: Sequence[RawCloud], reading: DataConfig | None = None) ->
     if reading is not None and reading.reflectance_scale is not None:
         return reading.reflectance_scale
     values = [cloud.reflectance for cloud in clouds if cloud.reflectance is not None]
-    return full_scale(max([highest_reflectance(each) for each in values if has_reflectance(each)], default=0.0))
+    values = [each[:: max(1, len(each) // SAMPLED_POINTS)] for each in values if has_reflectance(each)]
+    return full_scale(highest_reflectance(np.concatenate(values))) if values else 1.0
+
+
+def sensor_of(path: Path, raw: RawCloud) -> str:
+    """What tells the sensor of a file: the folder, the kind of file and the columns."""
+    return f"{path.parent}, {path.suffix.lower()}, {raw.columns}"
 
 
 def find_scales(paths: Sequence[Path], reading: DataConfig) -> dict[str, float]:
-    """The scale of every kind of columns among these files: one sensor has one scale, however dark a cloud is.
+    """The scale of every sensor among these files (`sensor_of`): one sensor has one scale, however dark a cloud is.
 
     Of many files some are looked at. A file that cannot be read tells nothing here: it is named when its turn comes.
     """
     step = max(1, len(paths) // SAMPLED_FILES)
-    kinds: dict[str, list[RawCloud]] = {}
+    sensors: dict[str, list[RawCloud]] = {}
     for path in paths[::step]:
         try:
             raw = read_raw(path, reading.columns)
         except (InputError, OSError):
             continue
-        kinds.setdefault(raw.columns, []).append(raw)
-    return {columns: find_scale(clouds, reading) for columns, clouds in kinds.items()}
+        sensors.setdefault(sensor_of(path, raw), []).append(raw)
+    return {sensor: find_scale(clouds, reading) for sensor, clouds in sensors.items()}
 
 
 def judge(raw: RawCloud, scale: float) -> Cloud:
@@ -117,10 +127,18 @@ def judge(raw: RawCloud, scale: float) -> Cloud:
     if raw.reflectance is not None:
         kept &= ~np.isinf(raw.reflectance)
     dropped = int(len(kept) - kept.sum())
-    if dropped:
+    silent = (raw.xyz == 0).all(axis=1)
+    no_echo = int(silent.sum())
+    if no_echo < NO_ECHO:
+        no_echo = 0
+    else:
+        kept &= ~silent
+    if dropped or no_echo:
         raw = raw._replace(xyz=raw.xyz[kept], reflectance=None if raw.reflectance is None else raw.reflectance[kept])
     reflectance = judge_reflectance(raw.reflectance, len(raw.xyz), scale)
-    return Cloud(np.column_stack((raw.xyz, reflectance.values)), reflectance, dropped)
+    notes = [dropped_note(dropped)] if dropped else []
+    notes += [f"{no_echo} points at 0, 0, 0, where no echo came back, were dropped"] if no_echo else []
+    return Cloud(np.column_stack((raw.xyz, reflectance.values)), reflectance, notes)
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -139,7 +157,7 @@ def _read_npy(path: Path, columns: Sequence[str]) -> RawCloud:
     if rows.ndim != 2 or rows.shape[1] < 3 or rows.dtype.kind not in "fiu":
         raise InputError(f"{path}: want numbers (N, 3) or (N, 4), got {rows.dtype} {rows.shape}")
     count = rows.shape[1]
-    if rows.shape[0] in (3, 4) and count > 16:
+    if 3 <= rows.shape[0] <= 16 < count:
         raise InputError(f"{path}: is transposed, {rows.shape}; save its .T, which is {rows.shape[::-1]}")
     if columns and len(columns) != count:
         raise InputError(f"{path}: has {count} numbers a point, and --columns names {len(columns)}")

@@ -18,8 +18,10 @@ REFLECTANCE = ("i", "intensity", "reflectance", "reflectivity", "remission")
 """Names that other tools give to the reflectance, in any case; CloudCompare puts scalar_ before them."""
 COUNTS = {3: ("x", "y", "z")} | {count: ("x", "y", "z", "i", *"_" * (count - 4)) for count in range(4, 17)}
 """What so many numbers a point are, unless the user says otherwise."""
-WRITERS = {5: "nuScenes", 6: "converters of Waymo's data"}
+WRITERS = {5: " as nuScenes writes them", 6: " as converters of Waymo's data write them"}
 TYPES = {"<f4": "float32", "<f8": "float64", "<f2": "float16"}
+LARGEST = {"<f4": 1e8, "<f8": 1e8, "<f2": 1e3}
+"""Largest usual number: map coordinates; any bits are a float16 up to 65504."""
 SAMPLED_ROWS = 4096
 FEWEST_ROWS = 32
 """Points from which on a file can tell its columns."""
@@ -84,48 +86,56 @@ def is_reflectance(name: str) -> bool:
 def read_numbers(data: bytes, path: Path, columns: Sequence[str] = ()) -> tuple[NDArray[np.floating], Layout]:
     """The numbers (N, C) of a .bin file, and what they are: these columns, or what the file looks like.
 
-    Raises InputError for a number of bytes that is no whole number of points; the message names the layouts that fit.
+    Raises InputError for a number of bytes that is no whole number of points, or numbers that are no coordinates; the
+    message names the layouts that fit.
     """
     layout = find_layout(data, columns)
-    if len(data) % layout.size:
+    whole = len(data) % layout.size == 0
+    if whole and (len(data) < layout.size * FEWEST_ROWS or sample(data, layout).possible):
+        return np.frombuffer(data, dtype=layout.dtype).reshape(-1, len(layout.names)), layout
+    if whole:
+        wrong = f"{path}: its numbers, as {layout}, are no coordinates in metres; "
+    else:
         what = "x, y, z, reflectance" if layout == FOUR else ", ".join(layout.names)
         wrong = f"{path}: {len(data)} bytes are no multiple of {layout.size}, the size of a point ({what} as float32); "
-        others = {} if columns else {len(each.names): each for each in possible_layouts(data)}
-        named = [
-            f"{each}{f' as {WRITERS[count]} writes them' if count in WRITERS else ''}: --columns {count}"
-            for count, each in others.items()
-        ]
-        raise InputError(wrong + (f"it may hold {', or '.join(named)}" if named else "is the file cut off?"))
-    return np.frombuffer(data, dtype=layout.dtype).reshape(-1, len(layout.names)), layout
+    if columns:
+        raise InputError(f"{wrong}give other --columns, or leave them out")
+    counts = dict.fromkeys(len(each.names) for each in possible_layouts(data) if each != FOUR)
+    named = [f"{count} numbers a point{WRITERS.get(count, '')}: --columns {count}" for count in counts]
+    remedy = f"it may hold {', or '.join(named)}" if named else "is the file cut off?"
+    raise InputError(wrong + ("is it a cloud?" if whole and not named else remedy))
 
 
 def find_layout(data: bytes, columns: Sequence[str] = ()) -> Layout:
     """The layout of a .bin file's content: of these columns, or the plainest; four float32 in doubt."""
-    names = tuple(columns) or FOUR.names
-    given = Layout(names)
+    given = Layout(tuple(columns) or FOUR.names)
     whole = len(data) % given.size == 0
-    look = sample(data, given) if whole else None
-    if look is not None and (look.is_smooth or (look.possible and columns) or len(data) < given.size * FEWEST_ROWS):
+    look = sample(data, given) if whole else Look(False, False, np.inf, 0.0)
+    if look.is_smooth or (whole and len(data) < given.size * FEWEST_ROWS and not columns):
         return given
+    if columns:
+        fitting = possible_layouts(data, columns)
+        return fitting[0] if fitting else given
     plain = []
-    for other in possible_layouts(data, columns):
+    for other in possible_layouts(data):
         seen = sample(data, other)
-        signed = seen.never_negative and not (look is not None and look.never_negative)
-        smooth = seen.is_smooth and (look is None or not look.possible or seen.step < SMOOTHER * look.step)
-        if (signed or smooth or columns) and len(data) >= other.size * FEWEST_ROWS:
+        # eight numbers may be two points of four
+        signed = seen.never_negative and not look.never_negative and len(other.names) < 8
+        smooth = seen.is_smooth and (not look.possible or seen.step < SMOOTHER * look.step)
+        if (signed or smooth) and len(data) >= other.size * FEWEST_ROWS:
             plain.append((seen.step, other))
     return min(plain)[1] if plain else given
 
 
 def possible_layouts(data: bytes, columns: Sequence[str] = ()) -> list[Layout]:
-    """The layouts, KITTI's aside, in which the content is whole points with numbers such as coordinates have.
+    """The layouts in which the content is whole points with numbers such as coordinates have, of these columns or any.
 
     Those of the first type that has any: float32, then float64, then float16.
     """
-    names = [tuple(columns)] if columns else [COUNTS[count] for count in (3, 4, 5, 6, 7)]
+    names = [tuple(columns)] if columns else [COUNTS[count] for count in (3, 4, 5, 6, 7, 8)]
     for dtype in TYPES:
-        fitting = [each for each in (Layout(every, dtype) for every in names) if each != FOUR and data]
-        fitting = [each for each in fitting if len(data) % each.size == 0 and sample(data, each).possible]
+        layouts = [Layout(each, dtype) for each in names] if data else []
+        fitting = [each for each in layouts if len(data) % each.size == 0 and sample(data, each).possible]
         if fitting:
             return fitting
     return []
@@ -148,9 +158,10 @@ def sample(data: bytes, layout: Layout) -> Look:
         if len(rows) < 2:
             return Look(True, False, np.inf, 0.0)
         size = np.abs(rows[:, [*xyz, *(k for k, name in enumerate(layout.names) if name == "i")]])
-        possible = np.mean((size == 0) | (size > 1e-7) & (size < 1e8) | np.isnan(size)) > 0.99
-        if layout.dtype == "<f4":  # a float64 with few digits has nothing but zeros in its lower half
-            possible &= np.mean(every[:SAMPLED_ROWS].reshape(-1)[::2] == 0) < 0.9
+        possible = np.mean((size == 0) | ((size > 1e-7) & (size < LARGEST[layout.dtype])) | np.isnan(size)) > 0.99
+        if layout.dtype == "<f4":  # the lower halves of float64 with few digits are zero
+            zero = np.frombuffer(data, "<f4", len(data) // 8 * 2)[: 4 * SAMPLED_ROWS].reshape(-1, 2) == 0
+            possible &= np.mean(zero[:, 0]) - np.mean(zero[:, 1]) < 0.4
         half = len(rows) // 2
         spread = np.median(np.abs(rows[:half, xyz] - rows[half : 2 * half, xyz]).sum(axis=1))
         signed = False

@@ -18,10 +18,9 @@ from torch import Tensor
 
 from hvnet.boxes import limit_angle
 from hvnet.config import DataConfig
-from hvnet.data.clouds import find_scales, judge, read_raw
+from hvnet.data.clouds import find_scale, find_scales, judge, read_raw, sensor_of
 from hvnet.data.frame import IMAGE_ERRORS, IMAGE_SIZE, Camera, Frame, Objects
 from hvnet.data.labels import DONTCARE, Floats, Labels, rename
-from hvnet.data.sensor import dropped_note
 from hvnet.data.stamps import Stamp, stamp_files
 from hvnet.exceptions import InputError
 
@@ -67,9 +66,10 @@ class KittiFrames:
         camera = frame_camera(self.folder, name, labels or _labels([]))
         path = find_file(self.folder / "velodyne", name, ".bin")
         raw = read_raw(path, self.reading.columns)
-        cloud = judge(raw, self.scales.get(raw.columns, 1.0))
+        scale = self.scales.get(sensor_of(path, raw))
+        cloud = judge(raw, find_scale([raw], self.reading) if scale is None else scale)
         points, in_view = cloud.points, ""
-        notes = [f"frame {name}: {dropped_note(cloud.dropped)}"] if cloud.dropped else []
+        notes = [f"frame {name}: {text}" for text in cloud.notes]
         # the same for all clouds, so that they are said once
         facts_of_all = [f"{self.folder / 'velodyne'}: {text}" for text in (raw.note, cloud.reflectance.note) if text]
         notes += [note] * bool(note) + facts_of_all
@@ -123,7 +123,8 @@ class KittiFrames:
         """See `stamps.stamp_of`: which label file, calibration and cloud frame k is read from, and how."""
         name = self.names[k]
         small = [find_file(self.folder / folder, name, ".txt") for folder in ("label_2", "calib")]
-        return stamp_files(small, repr(self.reading), find_file(self.folder / "velodyne", name, ".bin"))
+        reading = self.reading.columns, sorted(set(self.scales.values())), sorted(self.reading.classes.items())
+        return stamp_files(small, repr(reading), find_file(self.folder / "velodyne", name, ".bin"))
 
     @cached_property
     def scales(self) -> dict[str, float]:
@@ -165,7 +166,7 @@ def find_file(folder: Path, name: str, *suffixes: str) -> Path:
 
 def cloud_files(folder: Path) -> list[Path]:
     """The clouds of a folder such as training/, sorted."""
-    return sorted(file for file in (folder / "velodyne").glob("*") if file.suffix.lower() == ".bin")
+    return sorted(file for file in (folder / "velodyne").glob("*") if file.suffix in (".bin", ".BIN", ".Bin"))
 
 
 def view_reason(camera: Camera, seen: NDArray[np.bool_]) -> str:
@@ -176,7 +177,7 @@ def view_reason(camera: Camera, seen: NDArray[np.bool_]) -> str:
         return "the cloud has no points"
     what = f"its camera sees {seen.sum():,} of {len(seen):,} points"
     remedy = "give the calibration of these clouds or, without a camera, remove calib"
-    if np.allclose(camera.r0_rect @ camera.velo_to_cam[:, :3], np.eye(3), atol=0.01):
+    if np.allclose(camera.velo_to_cam[:, :3], np.eye(3), atol=0.01):
         return f"{what}: Tr_velo_to_cam is the identity, and a camera's axes are x right, y down, z forward; {remedy}"
     if camera.image is None:
         return f"{what}: its image, whose size would count, is missing, or its calibration is another's; {remedy}"
@@ -308,7 +309,8 @@ def read_labels(path: Path, scored: bool = False, *, needs_3d: bool = True) -> L
 def _labels(rows: list[list[str]], scored: bool = False) -> Labels:
     """Labels of the fields of every line; ValueError if one that should be a number is none."""
     values = np.array([[float(text) for text in row[1:]] for row in rows]).reshape(len(rows), 15 if scored else 14)
-    if not np.isfinite(values).all() or (values[:, 1] != np.trunc(values[:, 1])).any():
+    occlusion = values[:, 1]
+    if not np.isfinite(values).all() or (occlusion != np.trunc(occlusion)).any() or (np.abs(occlusion) > 2**31).any():
         raise ValueError
     return Labels(
         name=np.array([row[0] for row in rows], dtype=np.str_),
@@ -328,7 +330,7 @@ def _is_number(text: str, whole: bool) -> bool:
         value = float(text)
     except ValueError:
         return False
-    return math.isfinite(value) and (not whole or value == math.trunc(value))
+    return math.isfinite(value) and (not whole or (value == math.trunc(value) and abs(value) <= 2**31))
 
 
 def write_labels(path: Path, labels: Labels) -> None:
@@ -489,7 +491,7 @@ def box_rows(
 
 
 def _check_names(argument: str, names: Sequence[str]) -> None:
-    split = [name for name in names if len(str(name).split()) != 1]
+    split = [name for name in names if str(name).split() != [str(name)]]
     if split:
         raise ValueError(f"{argument}: want classes of one word each, got '{split[0]}'")
 

@@ -39,8 +39,14 @@ differ by 0.25 at most."""
 SAMPLED = 40_000
 """Points that are looked at: more of them tell the same."""
 FEW_IN_RANGE = 0.02
-"""Share of a cloud's points in range below which the reason is wanted: it is 0.2 of KITTI's whole scans."""
-HIGHEST = 500.0  # metres; ground further above or below the sensor is not found
+"""Share of a cloud's points in range below which the reason is wanted: it is 0.5 of KITTI's whole scans."""
+LOWEST = -100.0
+"""Metres from the sensor's origin from which on the ground is looked for, up to 1 km above."""
+USUAL = 0.5
+"""Metres up to which the ground may lie; above the origin, where heights are those of a map, it has to be plainer."""
+PLAIN_CELLS = 100
+UNDERGROUND = 0.05
+"""Share of the points that may lie below ground that is above the origin: else it is a ceiling, or treetops."""
 
 
 class Reflectance(NamedTuple):
@@ -71,7 +77,7 @@ def highest_reflectance(values: NDArray) -> float:
     values = values[np.isfinite(values) & (values > 0)].astype(np.float64)
     if not len(values):
         return 0.0
-    values = values[values / OUTLIER <= np.quantile(values, 0.95)]
+    values = values[values / OUTLIER <= np.quantile(values, 0.95, method="lower")]
     return float(np.quantile(values, 0.99, method="higher"))
 
 
@@ -123,12 +129,15 @@ def as_points(points: object, device: torch.device | str = "cpu") -> Tensor:
         raise ValueError(f"points: want real numbers, got {points.dtype}")
     tensor = torch.as_tensor(points, dtype=torch.float32, device=device)
     if tensor.ndim != 2 or tensor.shape[1] != 4:
-        hint = ": it is transposed, give points.T" if tensor.ndim == 2 and tensor.shape[0] == 4 else ""
+        turned = tensor.ndim == 2 and (tensor.shape[0] == 4 or 3 <= tensor.shape[0] <= 16 < tensor.shape[1])
+        hint = ": it is transposed, give points.T" if turned else ""
         raise ValueError(f"points: want shape (N, 4) with x, y, z, reflectance, got {tuple(tensor.shape)}{hint}")
     reflectance = tensor[:, 3]
     clean = reflectance.nan_to_num(0.0, math.inf, -math.inf).clamp(min=0)
     if len(tensor) >= FEWEST_POINTS:
-        clean = clean.where(clean.amin() < clean.amax(), 0.0)
+        unknown = reflectance.isnan()
+        low, high = (clean.where(~unknown, bound) for bound in (math.inf, -math.inf))
+        clean = clean.where(low.amin() < high.amax(), 0.0)
     if tensor.device.type == "cpu" and torch.equal(clean, reflectance):
         return tensor
     return torch.cat((tensor[:, :3], clean[:, None]), dim=1)
@@ -153,7 +162,7 @@ def too_bright(points: Tensor, point_range: Sequence[float]) -> Tensor:
 
 def reflectance_error(largest: float) -> str:
     """What to say of reflectances up to `largest` in an array."""
-    return f"points: want a reflectance from 0 to 1, got {largest:g}; divide column 4 by its scale, such as 255"
+    return f"points: want a reflectance from 0 to 1, got {largest:g}; divide column 4 by its scale, or clip outliers"
 
 
 def ground_height(points: Tensor) -> Tensor:
@@ -163,9 +172,9 @@ def ground_height(points: Tensor) -> Tensor:
     one. No length depends on the data, so that nothing is read from a GPU.
     """
     points = points[:: max(1, len(points) // SAMPLED), :3]
-    height, enough = _common_height(_low_heights(points, NEAR))
+    height, enough = _common_height(_low_heights(points, NEAR), points)
     if points.device.type == "cuda" or not enough:
-        wide, enough_wide = _common_height(_low_heights(points, FAR))
+        wide, enough_wide = _common_height(_low_heights(points, FAR), points)
         height = height.where(enough, wide.where(enough_wide, math.nan))
     return height.to(points.dtype)
 
@@ -174,31 +183,34 @@ def _low_heights(points: Tensor, far: float) -> Tensor:
     """The low points' height in metres in every cell (C,) up to a distance from the sensor; infinite in empty cells."""
     x, y, z = points.unbind(1)
     distance = torch.hypot(x, y)
-    ring = (distance >= NEAREST) & (distance < far) & (z.abs() < HIGHEST)  # false for NaN
+    # false for NaN
+    ring = (distance >= NEAREST) & (distance < far) & (z > LOWEST) & (z < LOWEST + 1000)
     if points.device.type == "cpu":
         x, y, z, ring = x[ring], y[ring], z[ring], ring[ring]
     side = math.ceil(2 * far / CELL)
     cell = ((x + far) / CELL).int().clamp(0, side - 1) * side + ((y + far) / CELL).int().clamp(0, side - 1)
     # cell and height, to the centimetre, in one number, which is sorted once
     levels = 2**17
-    key = torch.where(ring, cell * levels + ((z + HIGHEST) * 100).int(), side * side * levels).sort().values
+    key = torch.where(ring, cell * levels + ((z - LOWEST) * 100).int(), side * side * levels).sort().values
     starts = torch.searchsorted(key, torch.arange(side * side + 1, device=points.device, dtype=torch.int32) * levels)
     counts = starts.diff()
     if not len(key):
         return points.new_full((1,), math.inf)
     low = key[(starts[:-1] + counts // 20).clamp(max=len(key) - 1)] % levels
-    return torch.where(counts > 0, low / 100 - HIGHEST, math.inf)
+    return torch.where(counts > 0, low / 100 + LOWEST, math.inf)
 
 
-def _common_height(low: Tensor) -> tuple[Tensor, Tensor]:
-    """The height () that most of the heights (C,) are near, infinite ones left out, and whether they are enough."""
+def _common_height(low: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    """The height () that most of the low heights (C,) of points (N, 3) are near, and whether it is the ground's."""
     low = low.sort().values
     total = low.isfinite().sum()
     last = torch.searchsorted(low, low + WINDOW, right=True)
     counts = (last.minimum(total) - torch.arange(len(low), device=low.device)).clamp(min=0)
     best = counts.argmax()
+    height = low[best + counts[best] // 2]
     enough = (total >= FEWEST_CELLS) & (counts[best] >= GROUND_SHARE * total)
-    return low[best + counts[best] // 2], enough
+    below = (points[:, 2] < height - WINDOW).float().mean()
+    return height, enough & ((height < USUAL) | ((total >= PLAIN_CELLS) & (below < UNDERGROUND)))
 
 
 def shift_to(ground: Tensor, wanted: float) -> Tensor:
@@ -219,7 +231,7 @@ class Look(NamedTuple):
 
     def text(self) -> str:
         """In a few words."""
-        ground = "no ground found" if math.isnan(self.ground) else f"ground at {self.ground:.2f} m"
+        ground = "no ground found" if math.isnan(self.ground) else f"ground at {self.ground + 0.0:.2f} m"
         moved = f", moved to {self.ground + self.shift:.2f} m" if self.shift else ""
         return f"{self.points:,} points, {self.in_range:,} in range; {ground}{moved}"
 
@@ -256,7 +268,10 @@ def range_reason(points: Tensor, point_range: Sequence[float]) -> str:
     if size > 5 * reach:
         unit = "millimetres" if size > 50 * reach else "centimetres"
         return f"half of them are further than {size:,.0f} from the sensor, as in {unit}; metres are wanted"
-    low, high = (float(value) for value in finite[:, 2].quantile(finite.new_tensor([0.05, 0.95])))
+    if float((finite[:, :2].norm(dim=1) > point_range[3]).double().mean()) > 0.9:
+        return f"they are further from the sensor than {point_range[3]:g} m"
+    low, high = (float(value) for value in np.quantile(finite[:, 2].numpy(), [0.05, 0.95]))
     if high < point_range[2] or low >= point_range[5]:
-        return f"their heights are {low:.1f} to {high:.1f} m; give --sensor-height"
+        wanted = f"{point_range[2]:g} to {point_range[5]:g} m are seen"
+        return f"their heights above the sensor are {low:.1f} to {high:.1f} m, {wanted}; give another --sensor-height"
     return "they lie behind or beside the sensor; --turn or --all-round shows the detector that side"

@@ -1,6 +1,5 @@
 """The clouds that a user names: files, folders of files and KITTI roots, as one sequence of frames."""
 
-import os
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -8,10 +7,9 @@ from pathlib import Path
 import torch
 
 from hvnet.config import DataConfig
-from hvnet.data.clouds import SUFFIXES, find_scale, find_scales, is_cloud, judge, read_raw
+from hvnet.data.clouds import SUFFIXES, find_scale, find_scales, is_cloud, judge, read_raw, sensor_of
 from hvnet.data.frame import Frame, Frames, notes, object_names
 from hvnet.data.kitti import KittiFrames, cloud_files, find_file, has_camera, read_split
-from hvnet.data.sensor import dropped_note
 from hvnet.exceptions import InputError
 
 
@@ -34,12 +32,12 @@ class CloudFiles:
     def __getitem__(self, k: int) -> Frame:
         path = self.paths[k]
         raw = read_raw(path, self.reading.columns)
-        scale = self.scales.get(raw.columns)
+        scale = self.scales.get(sensor_of(path, raw))
         cloud = judge(raw, find_scale([raw], self.reading) if scale is None else scale)
-        said = [f"{path}: {dropped_note(cloud.dropped)}"] if cloud.dropped else []
-        said += [f"{path}: {raw.note}"] if raw.note else []
-        if note := cloud.reflectance.note:  # the same for all files, so that it is said once
-            said.append(f"{os.path.commonpath(self.siblings)}: {note}")
+        alone = sum(each.parent == path.parent for each in self.siblings) == 1
+        said = [f"{path}: {note}" for note in cloud.notes]
+        # the same for all files of a folder, so that it is said once
+        said += [f"{path if alone else path.parent}: {note}" for note in (raw.note, cloud.reflectance.note) if note]
         return Frame(self.names[k], torch.from_numpy(cloud.points), notes=said, reflectance=cloud.reflectance.fact)
 
     def object_names(self, k: int) -> None:

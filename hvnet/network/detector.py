@@ -48,6 +48,10 @@ SIDEWAYS = 2 / 3
 """Share of the reach straight ahead that a range must have in a direction for objects to be detected there."""
 
 
+SEAM = 2.0
+"""Metres by which looks in two directions overlap: each places a box between them a little differently."""
+
+
 class Placed(NamedTuple):
     """A cloud as the network sees it, once for every direction in which it looks."""
 
@@ -90,6 +94,10 @@ class Detector:
         turn: float = 0.0,
         all_round: bool = False,
     ) -> None:
+        if sensor_height not in ("found", "none") and not _is_number(sensor_height):
+            raise ValueError(f"sensor_height: want metres, 'found' or 'none', got {sensor_height!r}")
+        if not _is_number(turn):
+            raise ValueError(f"turn: want degrees, got {turn!r}")
         self.ground, self.reflectance, self.sensor_height = ground, reflectance, sensor_height
         turns = 1 if not all_round else turns_all_round(model.config.encoder.point_range)
         self.turns = [math.radians((turn + 360 * k / turns) % 360) for k in range(turns)]
@@ -184,8 +192,9 @@ class Detector:
         parts = []
         for each, angle in zip(found, self.turns, strict=True):
             if len(self.turns) > 1:
-                azimuth = torch.atan2(each.boxes[:, 1], each.boxes[:, 0])
-                each = each.select(azimuth.abs() <= math.pi / len(self.turns))
+                azimuth = torch.atan2(each.boxes[:, 1], each.boxes[:, 0]).abs() - math.pi / len(self.turns)
+                beyond = torch.hypot(each.boxes[:, 0], each.boxes[:, 1]) * azimuth.clamp(0, math.pi / 2).sin()
+                each = each.select(beyond <= SEAM)
             boxes = turned(each.boxes, -angle)
             boxes[:, 2] -= shift
             boxes[:, 6] = limit_angle(boxes[:, 6] - angle)
@@ -359,6 +368,10 @@ def regress(level: Tensor, at: Tensor, weight: Tensor, anchors: int) -> Tensor:
     return values[torch.arange(len(at), device=at.device), at % anchors]
 
 
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
 def turned(rows: Tensor, angle: float) -> Tensor:
     """Points (N, 4) or boxes (M, 7) with their x and y turned by an angle in radians, counter-clockwise."""
     if not angle:
@@ -398,11 +411,18 @@ def load(
     """
     path = SHIPPED if checkpoint is None else checkpoint
     content = load_checkpoint(path)
-    facts = content.get("sensor", {})
+    facts = content.get("sensor", {"ground": None, "reflectance_scale": None})
+    if not isinstance(facts, dict) or not all(
+        facts.get(key) is None or _is_number(facts[key]) for key in ("ground", "reflectance_scale")
+    ):
+        raise InputError(f"{path}: its facts on the sensor are damaged; train again or copy it again")
+    ground = facts.get("ground")
+    if ground is None and sensor_height not in ("found", "none"):
+        raise InputError(f"{path}: does not know the ground of its training data; leave the height of the sensor out")
     return Detector(
         model_from_checkpoint(content, str(path)),
         select_device(device),
-        ground=facts.get("ground"),
+        ground=ground,
         reflectance=facts.get("reflectance_scale") != 0,
         sensor_height=sensor_height,
         turn=turn,

@@ -214,7 +214,7 @@ def run_study(name: str, options: Options) -> None:
     if options.budget:
         with_budget(first, options.budget, 1)  # a mistake in it is said before the scenes are made
     data = read_data(name, first, options)
-    real = read_split_frames(options.validate, first.train.val_split) if options.validate else None
+    real = read_split_frames(options.validate, first.train.val_split, first.data) if options.validate else None
     outcomes: list[Outcome] = []
     if name == "speed":
         times, lines = time_rows({row: configs[row] for row in options.rows or configs}, data, device)

@@ -91,6 +91,8 @@ class Run:
             self.frames_id = hashlib.sha256(
                 json.dumps([list(data.train.names), list(data.val.names)]).encode()
             ).hexdigest()
+            if resume:  # before anything is written
+                self.check_checkpoint()
             self.loader = self.make_loader()
             self.model = HVNet(config).to(device)
             self.joint = ranks.wrap_ddp(self.model)  # the model, with its gradients averaged over the ranks
@@ -352,8 +354,8 @@ class Run:
             }
             save_checkpoint(self.checkpoint, content)
 
-    def restore(self) -> Progress:
-        """Resumes the run from its checkpoint. Raises InputError for a checkpoint of another run."""
+    def check_checkpoint(self) -> None:
+        """Raises InputError if the checkpoint is that of another run."""
         path, content = self.checkpoint, load_checkpoint(self.checkpoint)
         there = config_to_dict(config_from_dict(content["config"], str(path)))  # adds newer keys
         here = config_to_dict(self.config)
@@ -364,6 +366,10 @@ class Run:
             raise InputError(f"{path}: was trained with another {changed[0]}; give its config, or another --out")
         if content.get("frames") != self.frames_id:
             raise InputError(f"{path}: was trained on other frames; give its --data, or another --out")
+
+    def restore(self) -> Progress:
+        """Resumes the run from its checkpoint. Raises InputError if it is not whole."""
+        path, content = self.checkpoint, load_checkpoint(self.checkpoint)
         try:
             self.model.load_state_dict(content["model"])
             self.optimizer.load_state_dict(content["optimizer"])
