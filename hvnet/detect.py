@@ -216,7 +216,7 @@ def main(arguments: Sequence[str] | None) -> None:
     # looking all round wants the whole cloud, not what a camera sees
     frames = find_frames(options.inputs, options.split, reading, crop=not options.all_round)
     roots = [part for part in frames.parts if isinstance(part, KittiFrames)]
-    for folder in sorted({part.root / part.split_dir for part in roots}):
+    for folder in sorted({part.folder for part in roots}):
         if not has_camera(folder):
             if submit:
                 raise InputError(f"{folder / 'calib'}: no such folder, and the KITTI server wants 2D boxes; add it")

@@ -166,8 +166,8 @@ ARRAYS = {door.__name__: door for door in (array, own_format, own_format_in_trai
 class Case(NamedTuple):
     """What is wrong with a cloud, and what becomes of it."""
 
-    spoil: Callable[[Points], Points]
-    mend: Callable[[Points], Points] = lambda points: points
+    change: Callable[[Points], Points]
+    expect: Callable[[Points], Points] = lambda points: points
     arrays_say: str | None = None  # what an array, which has no file to find the scale of, is refused with
 
 
@@ -220,8 +220,8 @@ def folder(tmp_path: Path) -> Iterator[Path]:
 @pytest.mark.parametrize("case", CASES)
 def test_files(door: str, case: str, folder: Path) -> None:
     given = some_points()
-    found = FILES[door](CASES[case].spoil(given), folder)
-    wanted = CASES[case].mend(given)
+    found = FILES[door](CASES[case].change(given), folder)
+    wanted = CASES[case].expect(given)
     assert found.dtype == np.float32
     tolerance = 1e-6 if "bits" in case else 0  # k / 255 * 255 in float32
     np.testing.assert_allclose(found[:, 3], wanted[:, 3], rtol=tolerance, atol=0)
@@ -234,11 +234,11 @@ def test_arrays(door: str, case: str, folder: Path) -> None:
     given, said = some_points(), CASES[case].arrays_say
     if said is not None and not (case == "an infinite reflectance" and door != "array"):
         with pytest.raises(ValueError, match=said):
-            ARRAYS[door](CASES[case].spoil(given), folder)
+            ARRAYS[door](CASES[case].change(given), folder)
         return
-    found, wanted = ARRAYS[door](CASES[case].spoil(given), folder), CASES[case].mend(given)
+    found, wanted = ARRAYS[door](CASES[case].change(given), folder), CASES[case].expect(given)
     if case == "a reflectance just above 1":
-        wanted = CASES[case].spoil(given)  # within the tolerance
+        wanted = CASES[case].change(given)  # within the tolerance
     np.testing.assert_array_equal(found, wanted)
 
 

@@ -15,8 +15,8 @@ from hvnet.data.sensor import (
     GROUND_TOLERANCE,
     Look,
     as_points,
+    find_ground,
     full_scale,
-    ground_height,
     has_reflectance,
     highest_reflectance,
     inside,
@@ -152,7 +152,7 @@ def test_too_bright_is_what_is_in_range() -> None:
 
 @pytest.mark.parametrize("ground", [-3.2, -1.73, -0.33, 0.0, 12.0])
 def test_the_ground_is_found(ground: float) -> None:
-    found = ground_height(street(ground))
+    found = find_ground(street(ground))
     assert found.dtype == torch.float32
     assert float(found) == pytest.approx(ground, abs=0.05)
 
@@ -160,7 +160,7 @@ def test_the_ground_is_found(ground: float) -> None:
 def test_the_ground_of_a_sensor_high_up() -> None:
     """Which sees it from 20 m on only."""
     points = street(-6.0)
-    assert float(ground_height(points[torch.hypot(points[:, 0], points[:, 1]) > 20])) == pytest.approx(-6, abs=0.05)
+    assert float(find_ground(points[torch.hypot(points[:, 0], points[:, 1]) > 20])) == pytest.approx(-6, abs=0.05)
 
 
 @pytest.mark.parametrize("points", [
@@ -174,13 +174,13 @@ def test_the_ground_of_a_sensor_high_up() -> None:
     torch.cat((street(4.0), street(-1.7)[:3000] * torch.tensor([0.1, 0.1, 1, 1]))),  # a ceiling; the floor is near
 ])  # fmt: skip
 def test_no_ground(points: Tensor) -> None:
-    assert math.isnan(ground_height(points))
+    assert math.isnan(find_ground(points))
 
 
 def test_points_that_are_not_finite_are_not_in_the_way() -> None:
     points = street()
     points[::7, 2], points[1::7, 0], points[2::7, 1] = torch.nan, torch.inf, -torch.inf
-    assert float(ground_height(points)) == pytest.approx(-1.73, abs=0.05)
+    assert float(find_ground(points)) == pytest.approx(-1.73, abs=0.05)
 
 
 def test_a_cloud_is_moved_by_more_than_a_little() -> None:
@@ -193,7 +193,7 @@ def test_a_cloud_is_moved_by_more_than_a_little() -> None:
 def test_kitti_is_not_moved(kitti_root: Path) -> None:
     """Whole scans and what the camera sees."""
     for file in sorted((kitti_root / "training" / "velodyne").glob("*.bin")):
-        ground = ground_height(torch.from_numpy(read_cloud(file)[0]))
+        ground = find_ground(torch.from_numpy(read_cloud(file)[0]))
         assert abs(float(ground) + 1.66) < 0.3, file
 
 
@@ -203,7 +203,7 @@ def test_kitti_is_not_moved(kitti_root: Path) -> None:
 def test_the_ground_of_other_sensors(name: str, height: float) -> None:
     if not (SHARED / "clouds").is_dir():
         pytest.skip("no clouds of other sensors")
-    assert float(ground_height(torch.from_numpy(read_cloud(SHARED / "clouds" / name)[0]))) == pytest.approx(
+    assert float(find_ground(torch.from_numpy(read_cloud(SHARED / "clouds" / name)[0]))) == pytest.approx(
         height, abs=0.15
     )
 

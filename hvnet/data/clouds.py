@@ -27,7 +27,7 @@ from hvnet.exceptions import InputError
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
 SAMPLED_FILES = 16
-"""Files of a folder, or of a call, that tell the scale of the reflectance."""
+"""Files of a call or a root that tell the scale of the reflectance."""
 SAMPLED_POINTS = 20_000
 """... and points of each."""
 NO_ECHO = 10
@@ -77,9 +77,9 @@ def read_raw(path: Path, columns: Sequence[str] = ()) -> RawCloud:
     suffix = path.suffix.lower()
     if suffix == ".bin":
         rows, layout = read_numbers(_read_bytes(path), path, columns)
-        found = layout.dtype != FOUR.dtype if columns else layout != FOUR
-        note = f"read as {layout}: {', '.join(layout.names)}" + "; --columns says otherwise" * (not columns)
-        note = note if found else ""
+        note = ""
+        if layout.dtype != FOUR.dtype if columns else layout != FOUR:
+            note = f"read as {layout}: {', '.join(layout.names)}" + "; --columns says otherwise" * (not columns)
         return _raw({name: rows[:, k] for k, name in enumerate(layout.names) if name != "_"}, str(layout), note)
     if suffix == ".npy":
         return _read_npy(path, columns)
@@ -118,6 +118,13 @@ def find_scales(paths: Sequence[Path], reading: DataConfig) -> dict[str, float]:
     return {sensor: find_scale(clouds, reading) for sensor, clouds in sensors.items()}
 
 
+def read_scaled(path: Path, reading: DataConfig, scales: Mapping[str, float]) -> tuple[RawCloud, Cloud]:
+    """A file as it is, and its points at the scale of its sensor; the file's own where `scales` do not have it."""
+    raw = read_raw(path, reading.columns)
+    sensor = sensor_of(path, raw)
+    return raw, judge(raw, scales[sensor] if sensor in scales else find_scale([raw], reading))
+
+
 def judge(raw: RawCloud, scale: float) -> Cloud:
     """The points of a file, its reflectance divided by the scale. Points that are not finite are dropped.
 
@@ -127,12 +134,10 @@ def judge(raw: RawCloud, scale: float) -> Cloud:
     if raw.reflectance is not None:
         kept &= ~np.isinf(raw.reflectance)
     dropped = int(len(kept) - kept.sum())
-    silent = (raw.xyz == 0).all(axis=1)
-    no_echo = int(silent.sum())
-    if no_echo < NO_ECHO:
-        no_echo = 0
-    else:
-        kept &= ~silent
+    at_origin = (raw.xyz == 0).all(axis=1)
+    no_echo = int(at_origin.sum()) if at_origin.sum() >= NO_ECHO else 0
+    if no_echo:
+        kept &= ~at_origin
     if dropped or no_echo:
         raw = raw._replace(xyz=raw.xyz[kept], reflectance=None if raw.reflectance is None else raw.reflectance[kept])
     reflectance = judge_reflectance(raw.reflectance, len(raw.xyz), scale)

@@ -27,10 +27,10 @@ FEWEST_ROWS = 32
 """Points from which on a file can tell its columns."""
 SMOOTH = 0.25
 """Distance of neighbours in the file to that of points taken at random: 0.002 to 0.1 in scan order, 1 in none."""
-FEW = 0.005
-"""Share of negative reflectances that may be mistakes."""
 SMOOTHER = 0.5
-"""The same distance to that with four columns."""
+"""Distance of neighbours to that with four columns."""
+FEW_NEGATIVE = 0.005
+"""Share of negative reflectances that may be mistakes."""
 
 
 class Layout(NamedTuple):
@@ -52,8 +52,8 @@ class Layout(NamedTuple):
 FOUR = Layout(COUNTS[4])
 
 
-class Look(NamedTuple):
-    """How a sample of a file looks in a layout."""
+class Fit(NamedTuple):
+    """How well a layout fits a sample of a file."""
 
     possible: bool  # numbers such as coordinates have: neither huge nor tiny
     never_negative: bool  # the reflectance, while coordinates are
@@ -91,7 +91,7 @@ def read_numbers(data: bytes, path: Path, columns: Sequence[str] = ()) -> tuple[
     """
     layout = find_layout(data, columns)
     whole = len(data) % layout.size == 0
-    if whole and (len(data) < layout.size * FEWEST_ROWS or sample(data, layout).possible):
+    if whole and (len(data) < layout.size * FEWEST_ROWS or fit(data, layout).possible):
         return np.frombuffer(data, dtype=layout.dtype).reshape(-1, len(layout.names)), layout
     if whole:
         wrong = f"{path}: its numbers, as {layout}, are no coordinates in metres; "
@@ -110,18 +110,18 @@ def find_layout(data: bytes, columns: Sequence[str] = ()) -> Layout:
     """The layout of a .bin file's content: of these columns, or the plainest; four float32 in doubt."""
     given = Layout(tuple(columns) or FOUR.names)
     whole = len(data) % given.size == 0
-    look = sample(data, given) if whole else Look(False, False, np.inf, 0.0)
-    if look.is_smooth or (whole and len(data) < given.size * FEWEST_ROWS and not columns):
+    own = fit(data, given) if whole else Fit(False, False, np.inf, 0.0)
+    if own.is_smooth or (whole and len(data) < given.size * FEWEST_ROWS and not columns):
         return given
     if columns:
         fitting = possible_layouts(data, columns)
         return fitting[0] if fitting else given
     plain = []
     for other in possible_layouts(data):
-        seen = sample(data, other)
+        seen = fit(data, other)
         # eight numbers may be two points of four
-        signed = seen.never_negative and not look.never_negative and len(other.names) < 8
-        smooth = seen.is_smooth and (not look.possible or seen.step < SMOOTHER * look.step)
+        signed = seen.never_negative and not own.never_negative and len(other.names) < 8
+        smooth = seen.is_smooth and (not own.possible or seen.step < SMOOTHER * own.step)
         if (signed or smooth) and len(data) >= other.size * FEWEST_ROWS:
             plain.append((seen.step, other))
     return min(plain)[1] if plain else given
@@ -135,14 +135,14 @@ def possible_layouts(data: bytes, columns: Sequence[str] = ()) -> list[Layout]:
     names = [tuple(columns)] if columns else [COUNTS[count] for count in (3, 4, 5, 6, 7, 8)]
     for dtype in TYPES:
         layouts = [Layout(each, dtype) for each in names] if data else []
-        fitting = [each for each in layouts if len(data) % each.size == 0 and sample(data, each).possible]
+        fitting = [each for each in layouts if len(data) % each.size == 0 and fit(data, each).possible]
         if fitting:
             return fitting
     return []
 
 
-def sample(data: bytes, layout: Layout) -> Look:
-    """Looks at the file's points: at all of them or, if they are many, at four runs of them."""
+def fit(data: bytes, layout: Layout) -> Fit:
+    """How well a layout fits the points of a file: all of them or, if they are many, four runs of them."""
     every = np.frombuffer(data, dtype=layout.dtype).reshape(-1, len(layout.names))
     starts = np.linspace(0, len(every) - SAMPLED_ROWS // 4, 4).astype(int) if len(every) > SAMPLED_ROWS else [0]
     length = SAMPLED_ROWS // 4 if len(every) > SAMPLED_ROWS else SAMPLED_ROWS
@@ -156,7 +156,7 @@ def sample(data: bytes, layout: Layout) -> Look:
             steps.append(np.abs(np.diff(rows[:, xyz], axis=0)).sum(axis=1))
         rows = np.concatenate(runs)
         if len(rows) < 2:
-            return Look(True, False, np.inf, 0.0)
+            return Fit(True, False, np.inf, 0.0)
         size = np.abs(rows[:, [*xyz, *(k for k, name in enumerate(layout.names) if name == "i")]])
         possible = np.mean((size == 0) | ((size > 1e-7) & (size < LARGEST[layout.dtype])) | np.isnan(size)) > 0.99
         if layout.dtype == "<f4":  # the lower halves of float64 with few digits are zero
@@ -167,5 +167,5 @@ def sample(data: bytes, layout: Layout) -> Look:
         signed = False
         if "i" in layout.names:
             negative = np.mean(rows[:, layout.names.index("i")] < 0)
-            signed = bool(possible and negative < FEW and np.mean(rows[:, xyz] < 0) > 0.05)
-        return Look(bool(possible), signed, float(np.median(np.concatenate(steps))), float(spread))
+            signed = bool(possible and negative < FEW_NEGATIVE and np.mean(rows[:, xyz] < 0) > 0.05)
+        return Fit(bool(possible), signed, float(np.median(np.concatenate(steps))), float(spread))

@@ -223,8 +223,9 @@ class Frames(Protocol):
     """A sequence of frames: what training, validation, detection, evaluation, viewer and figures take.
 
     A data format is a class with these three. It may also have a method `object_names(k)` that reads less than `[k]`,
-    `notes`, what a user should know of all frames, and a method `stamp(k)`, which tells whether files have changed; see
-    the functions of these names, the last one in `hvnet.data.stamps`.
+    `notes`, what a user should know of all frames, a method `stamp(k)`, which tells whether files have changed (see the
+    functions of these names, the last one `hvnet.data.stamps.stamp_of`), and `scales`, what the reflectances of its
+    sensors were divided by.
     """
 
     @property

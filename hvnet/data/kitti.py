@@ -18,7 +18,7 @@ from torch import Tensor
 
 from hvnet.boxes import limit_angle
 from hvnet.config import DataConfig
-from hvnet.data.clouds import find_scale, find_scales, judge, read_raw, sensor_of
+from hvnet.data.clouds import find_scales, read_raw, read_scaled
 from hvnet.data.frame import IMAGE_ERRORS, IMAGE_SIZE, Camera, Frame, Objects
 from hvnet.data.labels import DONTCARE, Floats, Labels, rename
 from hvnet.data.stamps import Stamp, stamp_files
@@ -65,9 +65,7 @@ class KittiFrames:
         labels, note = self.labels(k)
         camera = frame_camera(self.folder, name, labels or _labels([]))
         path = find_file(self.folder / "velodyne", name, ".bin")
-        raw = read_raw(path, self.reading.columns)
-        scale = self.scales.get(sensor_of(path, raw))
-        cloud = judge(raw, find_scale([raw], self.reading) if scale is None else scale)
+        raw, cloud = read_scaled(path, self.reading, self.scales)
         points, in_view = cloud.points, ""
         notes = [f"frame {name}: {text}" for text in cloud.notes]
         # the same for all clouds, so that they are said once
@@ -128,7 +126,7 @@ class KittiFrames:
 
     @cached_property
     def scales(self) -> dict[str, float]:
-        """The scale of the reflectance of the root's clouds, by their columns."""
+        """The scale of the reflectance of every sensor among the root's clouds: see `clouds.sensor_of`."""
         return find_scales(cloud_files(self.folder), self.reading)
 
     @property
@@ -260,7 +258,7 @@ def write_points(path: Path, points: NDArray[np.float32]) -> None:
     if points.ndim != 2 or points.shape[1] != 4:
         raise ValueError(f"points: want shape (N, 4) with x, y, z, reflectance, got {points.shape}")
     _check_real("points", points)
-    with np.errstate(over="ignore"):  # what is too large for float32 is infinite, and dropped by who reads it
+    with np.errstate(over="ignore"):  # what is too large for float32 becomes infinite, and the reader drops it
         Path(path).write_bytes(np.ascontiguousarray(points, dtype="<f4").tobytes())
 
 
@@ -386,8 +384,8 @@ def read_calibration(path: Path) -> Camera:
                 raise InputError(f"{path}:{number}: {key} holds '{value[:60]}', not a finite number")
         found[key] = np.array([float(value) for value in texts]).reshape(rows, columns)
         with np.errstate(all="ignore"):
-            turns = key == "P2" or abs(np.linalg.det(found[key][:, :3]) - 1) <= 0.01
-        if not turns:
+            is_rotation = abs(np.linalg.det(found[key][:, :3]) - 1) <= 0.01
+        if key != "P2" and not is_rotation:
             raise InputError(f"{path}:{number}: {key} is no rotation: its determinant is not 1")
     missing = [key for key in shapes if key not in found]
     if missing:

@@ -40,10 +40,10 @@ SAMPLED = 40_000
 """Points that are looked at: more of them tell the same."""
 FEW_IN_RANGE = 0.02
 """Share of a cloud's points in range below which the reason is wanted: it is 0.5 of KITTI's whole scans."""
-LOWEST = -100.0
+LOWEST_GROUND = -100.0
 """Metres from the sensor's origin from which on the ground is looked for, up to 1 km above."""
-USUAL = 0.5
-"""Metres up to which the ground may lie; above the origin, where heights are those of a map, it has to be plainer."""
+ABOVE_ORIGIN = 0.5
+"""Metres from which on ground is above the sensor's origin, as with heights of a map: it has to be plainer then."""
 PLAIN_CELLS = 100
 UNDERGROUND = 0.05
 """Share of the points that may lie below ground that is above the origin: else it is a ceiling, or treetops."""
@@ -129,8 +129,8 @@ def as_points(points: object, device: torch.device | str = "cpu") -> Tensor:
         raise ValueError(f"points: want real numbers, got {points.dtype}")
     tensor = torch.as_tensor(points, dtype=torch.float32, device=device)
     if tensor.ndim != 2 or tensor.shape[1] != 4:
-        turned = tensor.ndim == 2 and (tensor.shape[0] == 4 or 3 <= tensor.shape[0] <= 16 < tensor.shape[1])
-        hint = ": it is transposed, give points.T" if turned else ""
+        transposed = tensor.ndim == 2 and (tensor.shape[0] == 4 or 3 <= tensor.shape[0] <= 16 < tensor.shape[1])
+        hint = ": it is transposed, give points.T" if transposed else ""
         raise ValueError(f"points: want shape (N, 4) with x, y, z, reflectance, got {tuple(tensor.shape)}{hint}")
     reflectance = tensor[:, 3]
     clean = reflectance.nan_to_num(0.0, math.inf, -math.inf).clamp(min=0)
@@ -165,7 +165,7 @@ def reflectance_error(largest: float) -> str:
     return f"points: want a reflectance from 0 to 1, got {largest:g}; divide column 4 by its scale, or clip outliers"
 
 
-def ground_height(points: Tensor) -> Tensor:
+def find_ground(points: Tensor) -> Tensor:
     """Height in metres of the ground around the sensor in a cloud (N, 3 or more): (), NaN where none is found.
 
     In every cell of 1 m the lowest twentieth of the points is skipped; the ground is where most cells agree on the next
@@ -184,20 +184,20 @@ def _low_heights(points: Tensor, far: float) -> Tensor:
     x, y, z = points.unbind(1)
     distance = torch.hypot(x, y)
     # false for NaN
-    ring = (distance >= NEAREST) & (distance < far) & (z > LOWEST) & (z < LOWEST + 1000)
+    ring = (distance >= NEAREST) & (distance < far) & (z > LOWEST_GROUND) & (z < LOWEST_GROUND + 1000)
     if points.device.type == "cpu":
         x, y, z, ring = x[ring], y[ring], z[ring], ring[ring]
     side = math.ceil(2 * far / CELL)
     cell = ((x + far) / CELL).int().clamp(0, side - 1) * side + ((y + far) / CELL).int().clamp(0, side - 1)
     # cell and height, to the centimetre, in one number, which is sorted once
     levels = 2**17
-    key = torch.where(ring, cell * levels + ((z - LOWEST) * 100).int(), side * side * levels).sort().values
+    key = torch.where(ring, cell * levels + ((z - LOWEST_GROUND) * 100).int(), side * side * levels).sort().values
     starts = torch.searchsorted(key, torch.arange(side * side + 1, device=points.device, dtype=torch.int32) * levels)
     counts = starts.diff()
     if not len(key):
         return points.new_full((1,), math.inf)
     low = key[(starts[:-1] + counts // 20).clamp(max=len(key) - 1)] % levels
-    return torch.where(counts > 0, low / 100 + LOWEST, math.inf)
+    return torch.where(counts > 0, low / 100 + LOWEST_GROUND, math.inf)
 
 
 def _common_height(low: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -210,7 +210,7 @@ def _common_height(low: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     height = low[best + counts[best] // 2]
     enough = (total >= FEWEST_CELLS) & (counts[best] >= GROUND_SHARE * total)
     below = (points[:, 2] < height - WINDOW).float().mean()
-    return height, enough & ((height < USUAL) | ((total >= PLAIN_CELLS) & (below < UNDERGROUND)))
+    return height, enough & ((height < ABOVE_ORIGIN) | ((total >= PLAIN_CELLS) & (below < UNDERGROUND)))
 
 
 def shift_to(ground: Tensor, wanted: float) -> Tensor:

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from hvnet.config import DataConfig
-from hvnet.data.clouds import SUFFIXES, find_scale, find_scales, is_cloud, judge, read_raw, sensor_of
+from hvnet.data.clouds import SUFFIXES, find_scales, is_cloud, read_scaled
 from hvnet.data.frame import Frame, Frames, notes, object_names
 from hvnet.data.kitti import KittiFrames, cloud_files, find_file, has_camera, read_split
 from hvnet.exceptions import InputError
@@ -31,9 +31,7 @@ class CloudFiles:
 
     def __getitem__(self, k: int) -> Frame:
         path = self.paths[k]
-        raw = read_raw(path, self.reading.columns)
-        scale = self.scales.get(sensor_of(path, raw))
-        cloud = judge(raw, find_scale([raw], self.reading) if scale is None else scale)
+        raw, cloud = read_scaled(path, self.reading, self.scales)
         alone = sum(each.parent == path.parent for each in self.siblings) == 1
         said = [f"{path}: {note}" for note in cloud.notes]
         # the same for all files of a folder, so that it is said once
@@ -45,7 +43,7 @@ class CloudFiles:
 
     @cached_property
     def scales(self) -> dict[str, float]:
-        """The scale of the reflectance of the files, by their columns."""
+        """The scale of the reflectance of every sensor among the files: see `clouds.sensor_of`."""
         return find_scales(self.siblings, self.reading)
 
 

@@ -21,7 +21,7 @@ from hvnet.data.sensor import (
     FEW_IN_RANGE,
     Look,
     as_points,
-    ground_height,
+    find_ground,
     inside,
     range_reason,
     reflectance_error,
@@ -42,12 +42,8 @@ SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "compact.pt"
 
 MAX_GRAPHS = 4
 """CUDA graphs that a detector keeps: each holds the memory of all that it calculates."""
-
-
 SIDEWAYS = 2 / 3
 """Share of the reach straight ahead that a range must have in a direction for objects to be detected there."""
-
-
 SEAM = 2.0
 """Metres by which looks in two directions overlap: each places a box between them a little differently."""
 
@@ -154,10 +150,12 @@ class Detector:
         if not self.reflectance:
             points = torch.cat((points[:, :3], torch.zeros_like(points[:, :1])), dim=1)
         shift, ground = points.new_zeros(()), points.new_full((), math.nan)
-        if self.sensor_height != "none":
-            ground = ground_height(points) if self.sensor_height == "found" else points.new_tensor(-self.sensor_height)
-        if self.sensor_height != "none" and self.ground is not None:
-            shift = shift_to(ground, self.ground)
+        if self.sensor_height == "found":
+            ground = find_ground(points)
+        elif self.sensor_height != "none":
+            ground = points.new_tensor(-self.sensor_height)
+        if self.ground is not None:
+            shift = shift_to(ground, self.ground)  # 0 where the ground is NaN
             if self.device.type == "cuda" or shift:  # a GPU is not asked
                 points = torch.cat((points[:, :2], points[:, 2:3] + shift, points[:, 3:]), dim=1)
         clouds = [turned(points, angle) for angle in self.turns]
@@ -192,8 +190,9 @@ class Detector:
         parts = []
         for each, angle in zip(found, self.turns, strict=True):
             if len(self.turns) > 1:
-                azimuth = torch.atan2(each.boxes[:, 1], each.boxes[:, 0]).abs() - math.pi / len(self.turns)
-                beyond = torch.hypot(each.boxes[:, 0], each.boxes[:, 1]) * azimuth.clamp(0, math.pi / 2).sin()
+                x, y = each.boxes[:, 0], each.boxes[:, 1]
+                sideways = torch.atan2(y, x).abs() - math.pi / len(self.turns)  # radians past the look's border
+                beyond = torch.hypot(x, y) * sideways.clamp(0, math.pi / 2).sin()  # metres
                 each = each.select(beyond <= SEAM)
             boxes = turned(each.boxes, -angle)
             boxes[:, 2] -= shift

@@ -25,7 +25,7 @@ from hvnet.data.scenes.street import Options
 from hvnet.data.sensor import (
     FEW_IN_RANGE,
     Look,
-    ground_height,
+    find_ground,
     inside,
     range_reason,
     reflectance_error,
@@ -241,7 +241,7 @@ def look_at_clouds(frames: Frames, wanted: Sequence[int], config: Config) -> tup
         with contextlib.suppress(InputError, OSError):  # named when its turn comes
             frame = frame_at(frames, k)
             points = frame.points
-            look = Look(len(points), int(inside(points, point_range).sum()), float(ground_height(points)), 0.0)
+            look = Look(len(points), int(inside(points, point_range).sum()), float(find_ground(points)), 0.0)
             looks.append(look)
             reflectances.append(frame.reflectance)
             bright |= bool(points[:, 3].any())
@@ -255,11 +255,13 @@ def look_at_clouds(frames: Frames, wanted: Sequence[int], config: Config) -> tup
     said = [f"clouds: {summary(looks, reflectances)}"] if looks else []
     if reasons:
         said.append(f"in {len(reasons)} of {len(looks)} clouds few points are in range; the first is {reasons[0]}")
-    better = []
-    for entry in config.head.classes if ground is not None else ():
-        bottom = entry.anchor_z - max(size[2] for size in entry.anchor_sizes) / 2
-        if ground is not None and abs(bottom - ground) > ANCHOR_TOLERANCE:
-            better.append(f"--set head.classes.{entry.name}.anchor_z={entry.anchor_z + ground - bottom:.2f}")
-    if better:
-        said.append(f"the ground lies at {ground:.2f} m, where the anchors do not stand; better: {' '.join(better)}")
+    if ground is not None:
+        better = []
+        for entry in config.head.classes:
+            half = max(size[2] for size in entry.anchor_sizes) / 2
+            if abs(entry.anchor_z - half - ground) > ANCHOR_TOLERANCE:
+                better.append(f"--set head.classes.{entry.name}.anchor_z={ground + half:.2f}")
+        if better:
+            where = f"the ground lies at {ground:.2f} m, where the anchors do not stand"
+            said.append(f"{where}; better: {' '.join(better)}")
     return {"ground": ground, "reflectance_scale": scale}, said
