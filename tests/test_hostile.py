@@ -1,8 +1,8 @@
 """A thousand hostile files: each gives a result or one clear error, and no memory grows.
 
 Clouds, labels, calibrations, configs and checkpoints of random bytes, and good ones that were cut, flipped or filled
-with impossible values; from nothing to 64 MB. An error is an InputError that names the file; anything else fails, a
-warning of numpy or torch too: it would be written to a user's terminal.
+with impossible values; clouds as other sensors have them; from nothing to 64 MB. An error is an InputError that names
+the file; anything else fails, a warning of numpy or torch too: it would be written to a user's terminal.
 """
 
 import contextlib
@@ -54,7 +54,7 @@ def size_of(generator: np.random.Generator) -> int:
 def values(generator: np.random.Generator) -> np.ndarray:
     """Points (N, 4) float32 with whatever floats can hold."""
     points = generator.normal(0, 20, (int(generator.integers(0, 3000)), 4)).astype(np.float32)
-    kind = generator.integers(0, 7)
+    kind = generator.integers(0, 13)
     if kind == 0:
         points[:] = 3.0
     elif kind == 1:
@@ -67,6 +67,18 @@ def values(generator: np.random.Generator) -> np.ndarray:
         points[:, 3] = generator.choice([np.nan, -1e30, 1e9, 65535, -1])
     elif kind == 5:
         points = points.view(np.uint32)[:, ::-1].copy().view(np.float32)
+    elif kind == 6:  # as other sensors count, far from the origin, in millimetres, without echoes
+        points[:, 3] = generator.integers(0, generator.choice([2, 256, 65536]), len(points))
+    elif kind == 7:
+        points[:, 3] = generator.choice([0, 0.5, 77])
+    elif kind == 8:
+        points[:, :3] += np.float32([4.5e5, 5.4e6, 110])
+    elif kind == 9:
+        points[:, :3] *= 1000
+    elif kind == 10:
+        points[generator.random(len(points)) < 0.5, :3] = 0
+    elif kind == 11:
+        points[:, 2] = generator.choice([-30, -0.33, 60]) + 0.01 * points[:, 2]
     return points
 
 
@@ -94,13 +106,18 @@ def cloud_file(generator: np.random.Generator) -> tuple[str, bytes]:
         return suffix, generator.bytes(size_of(generator))
     points = values(generator)
     if suffix == ".bin":
-        content = points.tobytes()
+        more = generator.normal(0, 20, (len(points), int(generator.integers(0, 5))))
+        with np.errstate(all="ignore"):
+            columns = np.concatenate((points, more), axis=1)[:, : generator.integers(3, 9)]
+            content = columns.astype(
+                str(generator.choice(["<f4", "<f8", "<f2", "<i4"], p=[0.7, 0.1, 0.1, 0.1]))
+            ).tobytes()
     elif suffix == ".npy":
         file = io.BytesIO()
         kinds = ["f4", "f8", "i4", "u1", "c8", "S3", "?"]
         with np.errstate(all="ignore"):
             array = points.astype(str(generator.choice(kinds, p=[0.4, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1])))
-        np.save(file, array[:, : generator.integers(0, 6)] if generator.random() < 0.5 else array)
+        np.save(file, (array[:, : generator.integers(0, 6)], array.T, array)[generator.integers(0, 3)])
         content = file.getvalue()
     elif suffix == ".pcd":
         header = PCD.format(n=len(points), kind=generator.choice(["binary", "ascii", "binary_compressed"]))
