@@ -17,7 +17,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from hvnet.kernels.launch import FLOATS, WARP_FLOAT, array, channels, check_tensor, lanes_of, launch
+from hvnet.kernels.launch import FLOATS, WARP_FLOAT, array, channels, check_tensor, lanes_of, launch, many_threads
 from hvnet.kernels.scatter import Segments
 from hvnet.kernels.voxel import NestedIndex
 
@@ -77,10 +77,10 @@ class Scale(NamedTuple):
 def scales_of(index: NestedIndex) -> tuple[list[Scale], Tensor, int]:
     """The scales of an index, the number of points kept on the device (1,), and a bound of it on the host.
 
-    On a CPU the counts are at hand and bound the work; on a GPU the number of points does, and nothing is read.
+    On a CPU the counts are at hand and bound the work; for many threads the number of points does, and nothing is read.
     """
     scales, capacity = len(index.counts) - 1, len(index.order)
-    *rows, kept = index.counts.tolist() if index.counts.device.type == "cpu" else [capacity] * (scales + 1)
+    *rows, kept = [capacity] * (scales + 1) if many_threads(index.counts.device) else index.counts.tolist()
     parts = [
         Scale(index.voxel[s], index.starts[s], index.cursor[s], index.counts[s : s + 1], rows[s]) for s in range(scales)
     ]
@@ -103,7 +103,7 @@ def encode_voxels(
     The weight (9, C) is that of g and its bias; the batch norm of the features (N, C) is in them already.
     """
     count = features.shape[1]
-    lanes = lanes_of(count)
+    lanes = lanes_of(count, features.device)
     values = features.new_empty(scale.rows, count)
     inputs = [channels(features, lanes), array(points, 4), array(mean, 4), channels(weight, lanes)]
     inputs += [array(scale.starts), array(scale.counts), int(relu), part * count // lanes]
@@ -115,7 +115,7 @@ def encode_voxels(
 def add_of_voxels(features: Tensor, of_voxels: Tensor, voxel: Tensor, kept: Tensor) -> None:
     """Adds to the features (N, C) of each point the rows of_voxels[t, voxel[t]] (T, V, C) of the voxels it lies in."""
     scales, rows, count = of_voxels.shape
-    lanes = lanes_of(count)
+    lanes = lanes_of(count, features.device)
     wide = array(of_voxels.view(scales, rows, count // lanes, lanes), lanes)
     inputs = [wide, array(voxel), array(kept), channels(features, lanes)]
     launch(_context_kernel(lanes), (features.shape[0], count // lanes), inputs, features.device)
@@ -129,7 +129,7 @@ def project_voxels(
     The weight (9, C) is that of g and its bias; the batch norm of the features (N, C) is in them already.
     """
     count = features.shape[1]
-    lanes = lanes_of(count)
+    lanes = lanes_of(count, features.device)
     inputs = [channels(features, lanes), array(points, 4), array(mean, 4), channels(weight, lanes)]
     inputs += [array(scale.starts), array(scale.counts), array(scale.cursor), int(relu), channels(image, lanes)]
     kernel = _project_kernel(lanes, wp.dtype_from_torch(image.dtype))
@@ -139,7 +139,7 @@ def project_voxels(
 def clear_voxels(image: Tensor, scale: Scale) -> None:
     """Sets the cells of these voxels of an image (B N_L N_W, C) to zero."""
     count = image.shape[1]
-    lanes = lanes_of(count)
+    lanes = lanes_of(count, image.device)
     kernel = _clear_kernel(lanes, wp.dtype_from_torch(image.dtype))
     inputs = [array(scale.cursor), array(scale.counts), channels(image, lanes)]
     launch(kernel, (scale.rows, count // lanes), inputs, image.device)
@@ -481,7 +481,7 @@ def _attend(
     relu: bool,
     keep: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    count, lanes = features.shape[1], lanes_of(features.shape[1])
+    count, lanes = features.shape[1], lanes_of(features.shape[1], features.device)
     outputs = _attend_outputs(features, points, mean, layer, order, starts, relu, keep)
     inputs = [
         channels(features.contiguous(), lanes),
@@ -529,7 +529,7 @@ def _attend_backward(
     argmax: Tensor,
     relu: bool,
 ) -> tuple[Tensor, Tensor]:
-    count, lanes = features.shape[1], lanes_of(features.shape[1])
+    count, lanes = features.shape[1], lanes_of(features.shape[1], features.device)
     blocks = -(-mean.shape[0] // VOXELS)
     grad_features, grad_layer = _attend_backward_outputs(
         grad_product, grad_values, features, points, mean, layer, order, starts, argmax, relu
@@ -586,7 +586,7 @@ def _column_sums_outputs(rows: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.library.custom_op("hvnet::column_sums", mutates_args=())
 def _column_sums(rows: Tensor) -> tuple[Tensor, Tensor]:
-    count, lanes = rows.shape[1], lanes_of(rows.shape[1])
+    count, lanes = rows.shape[1], lanes_of(rows.shape[1], rows.device)
     blocks = -(-rows.shape[0] // ROWS)
     outputs = _column_sums_outputs(rows)
     of_blocks = [rows.new_empty(blocks, count, dtype=torch.float64) for _ in outputs]
@@ -615,11 +615,11 @@ _column_sums.register_autograd(_column_sums_backward, setup_context=_save_rows)
 @torch.library.custom_op("hvnet::write_image", mutates_args=())
 def _write_image(features: Tensor, cursor: Tensor, cells: int) -> Tensor:
     shape = (cells, features.shape[1])
-    if features.device.type == "cpu":
+    if many_threads(features.device):
+        image = features.new_zeros(shape)
+    else:
         # from calloc: most pages hold no voxel and are never written
         image = torch.from_numpy(np.zeros(shape, dtype=np.float32 if features.dtype == torch.float32 else np.float64))
-    else:
-        image = features.new_zeros(shape)
     return image.index_copy_(0, cursor, features)
 
 

@@ -16,6 +16,18 @@ wp.config.log_level = wp.LOG_WARNING  # no banner, no line for every module that
 
 FLOATS = (torch.float32, torch.float64)
 WARP_FLOAT = {torch.float32: wp.float32, torch.float64: wp.float64}
+MAX_STRIDE = 2**31 - 1  # bytes: Warp keeps the strides of an array as int32
+
+force_many_threads = False
+"""Set by tests: the CPU runs what a GPU runs, with one thread after the other."""
+
+
+def many_threads(device: torch.device) -> bool:
+    """Whether work on a device is divided among many threads, and nothing is read back from it: so it is on a GPU.
+
+    One thread takes other ways: it counts as it goes, compares only what is left and goes through whole vectors.
+    """
+    return force_many_threads or device.type == "cuda"
 
 
 @functools.cache
@@ -54,6 +66,10 @@ def array(tensor: Tensor, lanes: int = 0) -> Any:
     It is a bare descriptor, made in half the time: a launch does not check its type, the public functions do.
     """
     start()
+    if tensor.ndim > 1 and tensor.stride(0) * tensor.element_size() > MAX_STRIDE:
+        raise ValueError(
+            f"a tensor of shape {tuple(tensor.shape)}: its rows are more than 2 GiB apart; split the batch"
+        )
     dtype = None
     if lanes:
         dtype = wp.types.vector(length=lanes, dtype=wp.dtype_from_torch(tensor.dtype))
@@ -66,9 +82,25 @@ def channels(tensor: Tensor, lanes: int) -> Any:
     return array(tensor.view(rows, count // lanes, lanes), lanes)
 
 
-def lanes_of(count: int) -> int:
-    """The longest vector that divides the channels: vector-typed loops are the ones that compilers vectorise."""
-    return next(lanes for lanes in (16, 4, 1) if count % lanes == 0)
+def lanes_of(count: int, device: torch.device) -> int:
+    """The channels that a thread takes of `count`.
+
+    On a CPU the longest vector that divides them: vector-typed loops are the ones that compilers vectorise. On a GPU
+    one: neighbouring threads then read neighbouring numbers.
+    """
+    return 1 if many_threads(device) else next(lanes for lanes in (16, 4, 1) if count % lanes == 0)
+
+
+@functools.cache
+def _warp_stream(device: str, handle: int) -> wp.Stream:
+    """Warp's view of a stream of torch; made anew for every launch, it would make and destroy events as well."""
+    return wp.Stream(device, cuda_stream=handle)
+
+
+def current_stream(device: torch.device) -> wp.Stream:
+    """Torch's current stream on a CUDA device."""
+    stream = torch.cuda.current_stream(device)
+    return _warp_stream(f"cuda:{stream.device_index}", stream.cuda_stream)
 
 
 def launch(kernel: wp.Kernel, dim: int | Sequence[int], inputs: Sequence[object], device: torch.device) -> None:
@@ -77,8 +109,8 @@ def launch(kernel: wp.Kernel, dim: int | Sequence[int], inputs: Sequence[object]
     if device.type == "cuda":
         if not wp.is_cuda_available():
             raise RuntimeError(cuda_problem() or "Warp sees no GPU")
-        stream = wp.stream_from_torch(torch.cuda.current_stream(device))
-        wp.launch(kernel, dim=dim, inputs=inputs, stream=stream, record_tape=False)
+        with torch.cuda.device(device):  # Warp leaves the device of the launch current
+            wp.launch(kernel, dim=dim, inputs=inputs, stream=current_stream(device), record_tape=False)
     else:
         wp.launch(kernel, dim=dim, inputs=inputs, device="cpu", record_tape=False)
 

@@ -11,7 +11,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from hvnet.kernels.launch import array, check_index, check_tensor, launch, start
+from hvnet.kernels.launch import array, check_index, check_tensor, current_stream, launch, start
 
 UNIT_TOLERANCE = 1e-3
 """How far from 1 the length of a direction may be: distances are in units of it, so a longer one is a mistake."""
@@ -89,7 +89,7 @@ def _raycast(
     start()
     on_stream: AbstractContextManager[object] = nullcontext()
     if vertices.is_cuda:  # the hierarchy is built, asked and freed in the order of torch's stream
-        on_stream = wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(vertices.device)))
+        on_stream = wp.ScopedStream(current_stream(vertices.device))
     with on_stream:
         indices = faces.to(torch.int32).contiguous().view(-1)
         # one triangle a leaf answers this many rays fastest: 38 ms against 48 ms for the 37,000 rays of a frame

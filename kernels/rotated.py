@@ -20,7 +20,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from hvnet.kernels.launch import FLOATS, WARP_FLOAT, array, check_tensor, launch
+from hvnet.kernels.launch import FLOATS, WARP_FLOAT, array, check_tensor, launch, many_threads
 
 WORD = 64  # boxes a word of the NMS mask
 
@@ -375,7 +375,7 @@ def _nms_order_outputs(boxes: Tensor, scores: Tensor, iou_threshold: float) -> t
 
 @torch.library.custom_op("hvnet::nms_order", mutates_args=())
 def _nms_order(boxes: Tensor, scores: Tensor, iou_threshold: float) -> tuple[Tensor, Tensor]:
-    if boxes.device.type == "cpu":  # elsewhere it would be a read of the device
+    if not many_threads(boxes.device):  # it reads the device
         _check_sizes("boxes", boxes)
     order, keep = _rank(boxes, scores, iou_threshold)
     _suppress(boxes[order], iou_threshold, keep)
@@ -417,10 +417,10 @@ def _rank(boxes: Tensor, scores: Tensor, iou_threshold: float) -> tuple[Tensor, 
 
 def _suppress(boxes: Tensor, iou_threshold: float, keep: Tensor) -> None:
     """Greedy NMS of boxes (M, 7), the best first: one that is kept clears keep (M,) bool of the worse it overlaps."""
-    if boxes.device.type == "cpu":
-        _suppress_serially(boxes, iou_threshold, keep)
-    else:
+    if many_threads(boxes.device):
         _suppress_in_parallel(boxes, iou_threshold, keep)
+    else:
+        _suppress_serially(boxes, iou_threshold, keep)
 
 
 def _suppress_serially(boxes: Tensor, iou_threshold: float, keep: Tensor) -> None:

@@ -258,7 +258,7 @@ def _segment_max_outputs(src: Tensor, index: Tensor, order: Tensor | None, start
 
 @torch.library.custom_op("hvnet::segment_max", mutates_args=())
 def _segment_max(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> tuple[Tensor, Tensor]:
-    count, lanes = src.shape[1], lanes_of(src.shape[1])
+    count, lanes = src.shape[1], lanes_of(src.shape[1], src.device)
     values, argmax = _segment_max_outputs(src, index, order, starts)
     inputs = [channels(src.contiguous(), lanes), _order_array(order, starts), array(starts.contiguous())]
     inputs += [channels(values, lanes), channels(argmax, lanes)]
@@ -277,7 +277,7 @@ def _segment_max_backward_outputs(grad: Tensor, argmax: Tensor, index: Tensor) -
 
 @torch.library.custom_op("hvnet::segment_max_backward", mutates_args=())
 def _segment_max_backward(grad: Tensor, argmax: Tensor, index: Tensor) -> Tensor:
-    count, lanes = grad.shape[1], lanes_of(grad.shape[1])
+    count, lanes = grad.shape[1], lanes_of(grad.shape[1], grad.device)
     grad_src = _segment_max_backward_outputs(grad, argmax, index)
     inputs = [channels(grad.contiguous(), lanes), channels(argmax.contiguous(), lanes), array(index.contiguous())]
     inputs += [channels(grad_src, lanes)]
@@ -295,7 +295,7 @@ def _segment_sum_outputs(src: Tensor, index: Tensor, order: Tensor | None, start
 
 @torch.library.custom_op("hvnet::segment_sum", mutates_args=())
 def _segment_sum(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
-    count, lanes = src.shape[1], lanes_of(src.shape[1])
+    count, lanes = src.shape[1], lanes_of(src.shape[1], src.device)
     values = _segment_sum_outputs(src, index, order, starts)
     inputs = [channels(src.contiguous(), lanes), _order_array(order, starts), array(starts.contiguous())]
     inputs += [channels(values, lanes)]
@@ -325,7 +325,7 @@ def _gather_add_outputs(base: Tensor, src: Tensor, voxel: Tensor, order: Tensor 
 
 @torch.library.custom_op("hvnet::gather_add", mutates_args=())
 def _gather_add(base: Tensor, src: Tensor, voxel: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
-    count, lanes = base.shape[1], lanes_of(base.shape[1])
+    count, lanes = base.shape[1], lanes_of(base.shape[1], base.device)
     values = _gather_add_outputs(base, src, voxel, order, starts)
     inputs = [channels(base.contiguous(), lanes), channels(src.contiguous(), lanes), array(voxel.contiguous())]
     inputs += [channels(values, lanes)]

@@ -12,7 +12,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from hvnet.kernels.launch import array, check_index, check_tensor, launch
+from hvnet.kernels.launch import array, check_index, check_tensor, launch, many_threads
 from hvnet.kernels.scatter import Segments, segments
 
 KEY_BITS = 31  # of a sort key: it shares an int64 with the number of its point
@@ -191,7 +191,7 @@ def nested_index(points: Tensor, sample: Tensor, grids: Sequence[Grid]) -> Neste
     device = points.device
     of_grid, of_scales, bits = _nesting(tuple(grids), device)
     inputs = [array(points.contiguous(), 4), array(sample.contiguous()), *of_grid]
-    if device.type == "cpu":
+    if not many_threads(device):
         return _serial_index(inputs, len(points), of_scales)
     keys = torch.empty(len(points), dtype=torch.int64, device=device)
     launch(_key_kernel, len(points), [*inputs, array(keys)], device)

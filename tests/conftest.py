@@ -9,6 +9,7 @@ import torch
 from hvnet.config import Config, config_to_dict, load_config
 from hvnet.data.scenes.files import generate
 from hvnet.data.scenes.street import Options
+from hvnet.kernels import launch
 from hvnet.network.checkpoint import save_checkpoint
 from hvnet.network.model import HVNet
 from tests.helpers import SHARED
@@ -32,6 +33,12 @@ def device(request: pytest.FixtureRequest) -> torch.device:
     if request.param == "cuda" and not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     return torch.device(request.param)
+
+
+@pytest.fixture(params=["one thread", "many threads"])
+def threads(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs a test both ways: as a CPU works, and as a GPU does, on the CPU."""
+    monkeypatch.setattr(launch, "force_many_threads", request.param == "many threads")
 
 
 @pytest.fixture(scope="session")

@@ -13,6 +13,7 @@ from torch import Tensor
 from hvnet.config import ClassConfig, Config, config_to_dict, load_config
 from hvnet.data.kitti import read_frame
 from hvnet.exceptions import InputError
+from hvnet.kernels import launch
 from hvnet.kernels.rotated import rotated_iou_bev
 from hvnet.network.anchors import MAX_HEIGHT, MAX_SIZE
 from hvnet.network.checkpoint import load_checkpoint, save_checkpoint
@@ -63,7 +64,7 @@ def test_arrays_of_fixed_size_give_the_same_boxes(demo: Config, monkeypatch: pyt
     want = detector(points)
     with torch.no_grad():
         levels, logits = detector.maps(points, torch.zeros(500, dtype=torch.int64), 1)
-        detector.device = torch.device("cuda")  # from here on as on a GPU
+        monkeypatch.setattr(launch, "force_many_threads", True)  # from here on as on a GPU
         candidates = detector.candidates(levels, logits)
     assert all(len(each.boxes) == 100 for each in candidates[0])
     assert any(not each.valid.all() for each in candidates[0])
@@ -147,10 +148,11 @@ def on_a_gpu(detector: Detector, points: Tensor) -> Detections:
     """What a detector on the CPU finds by the steps that it takes on a GPU."""
     with torch.no_grad():
         levels, scores = detector.maps(points, torch.zeros(len(points), dtype=torch.int64), 1)
-        detector.device = torch.device("cuda")
-        found = detector.suppress(detector.candidates(levels, scores))[0]
-        detector.device = CPU
-    return found
+        launch.force_many_threads = True
+        try:
+            return detector.suppress(detector.candidates(levels, scores))[0]
+        finally:
+            launch.force_many_threads = False
 
 
 @pytest.mark.parametrize("branch", ["location", "vertical"])

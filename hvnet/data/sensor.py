@@ -12,6 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hvnet.kernels.launch import many_threads
+
 Floats = NDArray[np.float32]
 
 FULL_SCALES = (1.0, 255.0, 65535.0)
@@ -138,7 +140,7 @@ def as_points(points: object, device: torch.device | str = "cpu") -> Tensor:
         unknown = reflectance.isnan()
         low, high = (clean.where(~unknown, bound) for bound in (math.inf, -math.inf))
         clean = clean.where(low.amin() < high.amax(), 0.0)
-    if tensor.device.type == "cpu" and torch.equal(clean, reflectance):
+    if not many_threads(tensor.device) and torch.equal(clean, reflectance):
         return tensor
     return torch.cat((tensor[:, :3], clean[:, None]), dim=1)
 
@@ -155,7 +157,7 @@ def too_bright(points: Tensor, point_range: Sequence[float]) -> Tensor:
     if not len(points):
         return points.new_zeros(())
     bright = points[:, 3] > 1 + TOLERANCE
-    if points.device.type == "cpu" and not bright.any():  # nearly always
+    if not many_threads(points.device) and not bright.any():  # nearly always
         return points.new_zeros(())
     return points[:, 3].where(bright & inside(points, point_range), 0.0).amax()
 
@@ -173,7 +175,7 @@ def find_ground(points: Tensor) -> Tensor:
     """
     points = points[:: max(1, len(points) // SAMPLED), :3]
     height, enough = _common_height(_low_heights(points, NEAR), points)
-    if points.device.type == "cuda" or not enough:
+    if many_threads(points.device) or not enough:
         wide, enough_wide = _common_height(_low_heights(points, FAR), points)
         height = height.where(enough, wide.where(enough_wide, math.nan))
     return height.to(points.dtype)
@@ -185,7 +187,7 @@ def _low_heights(points: Tensor, far: float) -> Tensor:
     distance = torch.hypot(x, y)
     # false for NaN
     ring = (distance >= NEAREST) & (distance < far) & (z > LOWEST_GROUND) & (z < LOWEST_GROUND + 1000)
-    if points.device.type == "cpu":
+    if not many_threads(points.device):
         x, y, z, ring = x[ring], y[ring], z[ring], ring[ring]
     side = math.ceil(2 * far / CELL)
     cell = ((x + far) / CELL).int().clamp(0, side - 1) * side + ((y + far) / CELL).int().clamp(0, side - 1)

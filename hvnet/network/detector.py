@@ -29,6 +29,7 @@ from hvnet.data.sensor import (
     too_bright,
 )
 from hvnet.exceptions import InputError
+from hvnet.kernels.launch import many_threads
 from hvnet.kernels.rotated import nms_order, rotated_nms
 from hvnet.network.anchors import anchors_per_cell, decode
 from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint
@@ -156,7 +157,7 @@ class Detector:
             ground = points.new_tensor(-self.sensor_height)
         if self.ground is not None:
             shift = shift_to(ground, self.ground)  # 0 where the ground is NaN
-            if self.device.type == "cuda" or shift:  # a GPU is not asked
+            if many_threads(self.device) or shift:  # a GPU is not asked
                 points = torch.cat((points[:, :2], points[:, 2:3] + shift, points[:, 3:]), dim=1)
         clouds = [turned(points, angle) for angle in self.turns]
         bright = torch.stack([too_bright(each, self.config.encoder.point_range) for each in clouds]).amax()
@@ -251,7 +252,7 @@ class Detector:
 
     def _candidates(self, label: int, b: int, levels: list[Tensor], scores: Tensor) -> Candidates:
         head, entry = self.config.head, self.entries[label]
-        if self.device.type == "cpu":
+        if not many_threads(self.device):
             at = (scores > head.score_threshold).nonzero().squeeze(1)
             at = at[torch.sort(scores[at], descending=True, stable=True).indices[: head.candidates]]
         else:  # as many for every cloud, so that no length is read from the device

@@ -15,6 +15,7 @@ from hvnet.kernels.encode import (
     scales_of,
     voxel_means,
 )
+from hvnet.kernels.launch import many_threads
 from hvnet.kernels.voxel import Grid, is_nested, nested_index
 from hvnet.network.encoder import AttentiveVFE, HybridVoxelEncoder, folded
 from hvnet.network.pillars import PillarEncoder
@@ -113,7 +114,7 @@ class FusedEncoder:
         key = (grid, batch_size, dtype, device)
         if key in self.written:
             image, last = self.written[key]
-            if device.type == "cuda":
+            if many_threads(device):
                 image.zero_()  # a graph replays what was captured: it would not know the cells written last
             else:
                 clear_voxels(image, last)
