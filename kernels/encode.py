@@ -18,7 +18,7 @@ import warp as wp
 from torch import Tensor
 
 from hvnet.kernels.launch import FLOATS, WARP_FLOAT, array, channels, check_tensor, lanes_of, launch, many_threads
-from hvnet.kernels.scatter import Segments
+from hvnet.kernels.scatter import CHUNK, Segments, cut_voxel, ends_of, order_array, point_at, share_of, tasks_of
 from hvnet.kernels.voxel import NestedIndex
 
 ROWS = 1024  # rows that are summed as one block
@@ -47,7 +47,7 @@ def attend(
     check_tensor("points", points, (features.dtype,), (features.shape[0], 4), like=features)
     check_tensor("mean", mean, (features.dtype,), (voxels.starts.shape[0] - 1, 4), like=features)
     check_tensor("layer", layer, (features.dtype,), (LAYER, count), like=features)
-    product, values, _ = _attend(features, points, mean, layer, voxels.order, voxels.starts, relu, keep)
+    product, values, _ = _attend(features, points, mean, layer, voxels.voxel, voxels.order, voxels.starts, relu, keep)
     return product, values
 
 
@@ -70,70 +70,104 @@ class Scale(NamedTuple):
     voxel: Tensor  # (N,) int64, the voxel of each point
     starts: Tensor  # int64, where each voxel's points start
     cursor: Tensor  # int64, cursor of each voxel
-    counts: Tensor  # (1,) int64, number of voxels, on the device
-    rows: int  # as many voxels or more, known on the host
+    count: Tensor  # (1,) int64, number of voxels, on the device
+    kept: Tensor  # (1,) int64, number of points, on the device
+    mean: Tensor  # (rows, 4) float32, of each voxel's points
 
 
-def scales_of(index: NestedIndex) -> tuple[list[Scale], Tensor, int]:
-    """The scales of an index, the number of points kept on the device (1,), and a bound of it on the host.
+def scales_of(index: NestedIndex, points: Tensor, finest: int) -> tuple[list[Scale], Tensor]:
+    """The scales of an index of points (N, 4) float32, and the points in its order; `finest` is the finest scale.
 
     On a CPU the counts are at hand and bound the work; for many threads the number of points does, and nothing is read.
     """
-    scales, capacity = len(index.counts) - 1, len(index.order)
-    *rows, kept = [capacity] * (scales + 1) if many_threads(index.counts.device) else index.counts.tolist()
-    parts = [
-        Scale(index.voxel[s], index.starts[s], index.cursor[s], index.counts[s : s + 1], rows[s]) for s in range(scales)
-    ]
-    return parts, index.counts[scales:], kept
+    scales, capacity, device = len(index.counts) - 1, len(index.order), points.device
+    *rows, kept = [capacity] * (scales + 1) if many_threads(device) else index.counts.tolist()
+    points = points[index.order[:kept]]
+    counts = index.counts.split(1)
+    means = voxel_means(points, index, finest, max(rows))
+    return [
+        Scale(index.voxel[s], index.starts[s], index.cursor[s], counts[s], counts[scales], means[s, : rows[s]])
+        for s in range(scales)
+    ], points
 
 
-def voxel_means(points: Tensor, scale: Scale) -> Tensor:
-    """Means (rows, 4) of the points (N, 4) float32 of each voxel."""
-    mean = points.new_empty(scale.rows, 4)
-    inputs = [array(points, 4), array(scale.starts), array(scale.counts), array(mean, 4)]
-    launch(_means, scale.rows, inputs, points.device)
-    return mean
+def voxel_means(points: Tensor, index: NestedIndex, finest: int, rows: int) -> Tensor:
+    """Means (S, rows, 4) of the points (N, 4) float32, in the order of the index, of each voxel of its S scales.
+
+    The sums of a coarser voxel are those of its children at the finest scale.
+    """
+    scales, size = len(index.counts) - 1, chunk_of(points.device)
+    tasks = tasks_of(size, len(points))
+    means = points.new_empty(scales, rows, 4)
+    sums = points.new_empty(rows, 4, dtype=torch.float64)
+    ends = points.new_empty(2, tasks, 4, dtype=torch.float64)
+    places = [array(index.starts), array(index.voxel), array(index.counts), finest]
+    inputs = [*places, size, array(ends, 4), array(sums, 4), array(means, 4)]
+    launch(_sums, tasks, [array(points, 4), *inputs], points.device)
+    launch(_sums_join, tasks, inputs, points.device)
+    launch(_means, (scales, rows), [*places, array(sums, 4), array(means, 4)], points.device)
+    return means
+
+
+def chunk_of(device: torch.device) -> int:
+    """The points of a task: one thread takes as many as leave their features in its cache."""
+    return CHUNK if many_threads(device) else 256
 
 
 def encode_voxels(
-    features: Tensor, points: Tensor, mean: Tensor, weight: Tensor, scale: Scale, relu: bool, product: Tensor, part: int
+    features: Tensor, points: Tensor, weight: Tensor, scale: Scale, relu: bool, product: Tensor, part: int
 ) -> Tensor:
     """`attend` without gradients: writes M to the part-th C columns of product (N, T C), returns G' (rows, C).
 
     The weight (9, C) is that of g and its bias; the batch norm of the features (N, C) is in them already.
     """
     count = features.shape[1]
-    lanes = lanes_of(count, features.device)
-    values = features.new_empty(scale.rows, count)
-    inputs = [channels(features, lanes), array(points, 4), array(mean, 4), channels(weight, lanes)]
-    inputs += [array(scale.starts), array(scale.counts), int(relu), part * count // lanes]
-    inputs += [channels(product, lanes), channels(values, lanes)]
-    launch(_kernels(wp.float32, lanes).encode, (scale.rows, count // lanes), inputs, features.device)
+    values = features.new_empty(len(scale.mean), count)
+    column = part * count // lanes_of(count, features.device)
+    _encode(features, points, weight, scale, scale.cursor[:0], relu, product, column, values)
     return values
 
 
-def add_of_voxels(features: Tensor, of_voxels: Tensor, voxel: Tensor, kept: Tensor) -> None:
-    """Adds to the features (N, C) of each point the rows of_voxels[t, voxel[t]] (T, V, C) of the voxels it lies in."""
-    scales, rows, count = of_voxels.shape
-    lanes = lanes_of(count, features.device)
-    wide = array(of_voxels.view(scales, rows, count // lanes, lanes), lanes)
-    inputs = [wide, array(voxel), array(kept), channels(features, lanes)]
-    launch(_context_kernel(lanes), (features.shape[0], count // lanes), inputs, features.device)
-
-
-def project_voxels(
-    features: Tensor, points: Tensor, mean: Tensor, weight: Tensor, scale: Scale, relu: bool, image: Tensor
-) -> None:
+def project_voxels(features: Tensor, points: Tensor, weight: Tensor, scale: Scale, relu: bool, image: Tensor) -> None:
     """`attend` and Eq. 3 without gradients: writes G' to the cells of the image (B N_L N_W, C), float of any width.
 
     The weight (9, C) is that of g and its bias; the batch norm of the features (N, C) is in them already.
     """
-    count = features.shape[1]
+    _encode(features, points, weight, scale, scale.cursor, relu, features[:0], 0, image)
+
+
+def _encode(
+    features: Tensor,
+    points: Tensor,
+    weight: Tensor,
+    scale: Scale,
+    cursor: Tensor,
+    relu: bool,
+    product: Tensor,
+    column: int,
+    values: Tensor,
+) -> None:
+    """Writes M to the product from a column of vectors on, if it has rows, and G' to the rows of values that the cursor
+    gives, or to those of the voxels if it is empty."""
+    count, size = features.shape[1], chunk_of(features.device)
+    lanes, tasks = lanes_of(count, features.device), tasks_of(size, len(points))
+    ends = channels(ends_of(tasks, features), lanes)
+    inputs = [array(scale.starts), array(scale.voxel), array(scale.voxel[:0]), array(scale.kept), array(cursor), size]
+    inputs += [ends, channels(values, lanes)]
+    of_points = [channels(features, lanes), array(points, 4), array(scale.mean, 4), channels(weight, lanes)]
+    of_points += [int(relu), column, channels(product, lanes)]
+    kernels = _inference_kernels(lanes, wp.dtype_from_torch(values.dtype))
+    launch(kernels.encode, (tasks, count // lanes), inputs + of_points, features.device)
+    launch(kernels.join, (tasks, count // lanes), inputs, features.device)
+
+
+def add_of_voxels(features: Tensor, of_voxels: Tensor, voxel: Tensor, kept: Tensor) -> None:
+    """Adds to the features (N, C) of each point the rows of_voxels[t, voxel[t]] (T, V, C) of the voxels it lies in."""
+    rows, count = of_voxels.shape[1:]
     lanes = lanes_of(count, features.device)
-    inputs = [channels(features, lanes), array(points, 4), array(mean, 4), channels(weight, lanes)]
-    inputs += [array(scale.starts), array(scale.counts), array(scale.cursor), int(relu), channels(image, lanes)]
-    kernel = _project_kernel(lanes, wp.dtype_from_torch(image.dtype))
-    launch(kernel, (scale.rows, count // lanes), inputs, features.device)
+    # flat: the stride of a third dimension would leave int32 with four million rows
+    inputs = [channels(of_voxels.flatten(0, 1), lanes), rows, array(voxel), array(kept), channels(features, lanes)]
+    launch(_context_kernel(lanes), (features.shape[0], count // lanes), inputs, features.device)
 
 
 def clear_voxels(image: Tensor, scale: Scale) -> None:
@@ -141,8 +175,8 @@ def clear_voxels(image: Tensor, scale: Scale) -> None:
     count = image.shape[1]
     lanes = lanes_of(count, image.device)
     kernel = _clear_kernel(lanes, wp.dtype_from_torch(image.dtype))
-    inputs = [array(scale.cursor), array(scale.counts), channels(image, lanes)]
-    launch(kernel, (scale.rows, count // lanes), inputs, image.device)
+    inputs = [array(scale.cursor), array(scale.count), channels(image, lanes)]
+    launch(kernel, (len(scale.mean), count // lanes), inputs, image.device)
 
 
 def knowledge(points: Tensor, mean: Tensor, voxel: Tensor) -> Tensor:
@@ -152,20 +186,15 @@ def knowledge(points: Tensor, mean: Tensor, voxel: Tensor) -> Tensor:
 
 
 @functools.cache
-def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
-    """The kernels for one floating type and vector length, in a module of their own."""
+def _functions(dtype: Any, lanes: int) -> SimpleNamespace:
+    """What the kernels of training and of inference share, for one floating type and vector length."""
     vec = wp.types.vector(length=lanes, dtype=dtype)
     point = wp.types.vector(length=4, dtype=dtype)
-    int_vec = wp.types.vector(length=lanes, dtype=wp.int32)
-    wide = wp.types.vector(length=lanes, dtype=wp.float64)
-    module = wp.Module(f"hvnet_encode_{dtype.__name__}_{lanes}", None)
-    zero = dtype(0.0)
 
     @wp.func
-    def of_voxel(weight: wp.array2d(dtype=vec), c: int, mean: point):
+    def of_voxel(w4: vec, w5: vec, w6: vec, w7: vec, bias: vec, mean: point):
         """The part of the attention that all points of a voxel share."""
-        shared = weight[8, c] + mean[0] * weight[4, c] + mean[1] * weight[5, c]
-        return shared + mean[2] * weight[6, c] + mean[3] * weight[7, c]
+        return bias + mean[0] * w4 + mean[1] * w5 + mean[2] * w6 + mean[3] * w7
 
     @wp.func
     def of_point(w0: vec, w1: vec, w2: vec, w3: vec, p: point, mean: point):
@@ -181,12 +210,60 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
             b = wp.max(b, vec())
         return wp.cw_mul(b, a)
 
+    return SimpleNamespace(of_voxel=of_voxel, of_point=of_point, attended=attended)
+
+
+@functools.cache
+def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
+    """The kernels of training for one floating type and vector length, in a module of their own."""
+    vec = wp.types.vector(length=lanes, dtype=dtype)
+    point = wp.types.vector(length=4, dtype=dtype)
+    int_vec = wp.types.vector(length=lanes, dtype=wp.int32)
+    wide = wp.types.vector(length=lanes, dtype=wp.float64)
+    module = wp.Module(f"hvnet_encode_{dtype.__name__}_{lanes}", None)
+    functions = _functions(dtype, lanes)
+    of_voxel, of_point, attended = functions.of_voxel, functions.of_point, functions.attended
+    zero = dtype(0.0)
+
     @wp.func
-    def point_at(order: wp.array(dtype=wp.int64), k: int):
-        i = k
-        if order.shape[0] > 0:
-            i = int(order[k])
-        return i
+    def largest_of(
+        features: wp.array2d(dtype=vec),
+        points: wp.array(dtype=point),
+        order: wp.array(dtype=wp.int64),
+        relu: int,
+        product: wp.array2d(dtype=vec),
+        begin: int,
+        end: int,
+        is_first: bool,
+        c: int,
+        centre: point,
+        shared: vec,
+        w0: vec,
+        w1: vec,
+        w2: vec,
+        w3: vec,
+        scale: vec,
+        shift: vec,
+    ):
+        """Writes the product of a voxel's points, or of a part that may be its first; returns maximum and arg-max."""
+        best = vec()
+        if not is_first:
+            best = vec(-dtype(wp.inf))  # a NaN stays the maximum only where a voxel begins with it
+        of_best = int_vec(-1)
+        for k in range(begin, end):
+            i = point_at(order, k)
+            attention = shared + of_point(w0, w1, w2, w3, points[i], centre)
+            row = attended(wp.cw_mul(features[i, c], scale) + shift, attention, relu)
+            if product.shape[0] > 0:
+                product[i, c] = row
+            if is_first and k == begin:
+                best = row
+                of_best = int_vec(i)
+            for lane in range(lanes):
+                if row[lane] >= best[lane]:
+                    best[lane] = row[lane]
+                    of_best[lane] = i
+        return best, of_best
 
     @wp.kernel(enable_backward=False, module=module)
     def forward(
@@ -201,29 +278,107 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         values: wp.array2d(dtype=vec),
         argmax: wp.array2d(dtype=int_vec),
     ):
-        voxel, c = wp.tid()
-        centre = mean[voxel]
-        shared = of_voxel(weight, c, centre)
-        w0, w1, w2, w3 = weight[0, c], weight[1, c], weight[2, c], weight[3, c]
-        scale, shift = weight[9, c], weight[10, c]
-        best = vec()
-        at = int_vec(-1)
-        start = int(starts[voxel])
-        for k in range(start, int(starts[voxel + 1])):
-            i = point_at(order, k)
-            attention = shared + of_point(w0, w1, w2, w3, points[i], centre)
-            row = attended(wp.cw_mul(features[i, c], scale) + shift, attention, relu)
-            if product.shape[0] > 0:
-                product[i, c] = row
-            if k == start:
-                best = row
-                at = int_vec(i)
+        v, c = wp.tid()
+        centre = mean[v]
+        shared = of_voxel(weight[4, c], weight[5, c], weight[6, c], weight[7, c], weight[8, c], centre)
+        w0, w1, w2, w3, w9, w10 = weight[0, c], weight[1, c], weight[2, c], weight[3, c], weight[9, c], weight[10, c]
+        begin, end = int(starts[v]), int(starts[v + 1])
+        best, of_best = largest_of(
+            features, points, order, relu, product, begin, end, True, c, centre, shared, w0, w1, w2, w3, w9, w10
+        )
+        values[v, c] = best
+        argmax[v, c] = of_best
+
+    @wp.kernel(enable_backward=False, module=module)
+    def forward_of_chunk(
+        features: wp.array2d(dtype=vec),
+        points: wp.array(dtype=point),
+        mean: wp.array(dtype=point),
+        weight: wp.array2d(dtype=vec),
+        order: wp.array(dtype=wp.int64),
+        starts: wp.array(dtype=wp.int64),
+        relu: int,
+        product: wp.array2d(dtype=vec),
+        values: wp.array2d(dtype=vec),
+        argmax: wp.array2d(dtype=int_vec),
+        voxel: wp.array(dtype=wp.int64),
+        ends: wp.array3d(dtype=vec),
+        ends_argmax: wp.array3d(dtype=int_vec),
+    ):
+        task, c = wp.tid()
+        share = share_of(task, CHUNK, points.shape[0], mean.shape[0], voxel, order, starts)
+        first, last = share[0], share[1]
+        w0 = weight[0, c]
+        w1 = weight[1, c]
+        w2 = weight[2, c]
+        w3 = weight[3, c]
+        w4 = weight[4, c]
+        w5 = weight[5, c]
+        w6 = weight[6, c]
+        w7 = weight[7, c]
+        w8 = weight[8, c]
+        w9 = weight[9, c]
+        w10 = weight[10, c]
+        for v in range(share[2], share[3]):
+            begin, end = int(starts[v]), int(starts[v + 1])
+            centre = mean[v]
+            shared = of_voxel(w4, w5, w6, w7, w8, centre)
+            best, of_best = largest_of(
+                features,
+                points,
+                order,
+                relu,
+                product,
+                wp.max(begin, first),
+                wp.min(end, last),
+                begin >= first,
+                c,
+                centre,
+                shared,
+                w0,
+                w1,
+                w2,
+                w3,
+                w9,
+                w10,
+            )
+            if begin < first:
+                ends[0, task, c] = best
+                ends_argmax[0, task, c] = of_best
+            elif end > last:
+                ends[1, task, c] = best
+                ends_argmax[1, task, c] = of_best
+            else:
+                values[v, c] = best
+                argmax[v, c] = of_best
+
+    @wp.kernel(enable_backward=False, module=module)
+    def forward_join(
+        order: wp.array(dtype=wp.int64),
+        starts: wp.array(dtype=wp.int64),
+        values: wp.array2d(dtype=vec),
+        argmax: wp.array2d(dtype=int_vec),
+        voxel: wp.array(dtype=wp.int64),
+        ends: wp.array3d(dtype=vec),
+        ends_argmax: wp.array3d(dtype=int_vec),
+    ):
+        task, c = wp.tid()
+        v = cut_voxel(task, CHUNK, voxel.shape[0], voxel, order, starts)
+        if v < 0:
+            return
+        best = ends[1, task, c]
+        of_best = ends_argmax[1, task, c]
+        k = task + 1
+        while k * CHUNK < int(starts[v + 1]):
+            row = ends[0, k, c]
+            of_row = ends_argmax[0, k, c]
             for lane in range(lanes):
-                if row[lane] >= best[lane]:
+                if row[lane] >= best[lane] and of_row[lane] >= 0:
                     best[lane] = row[lane]
-                    at[lane] = i
-        values[voxel, c] = best
-        argmax[voxel, c] = at
+                    of_best[lane] = of_row[lane]
+            k += 1
+        values[v, c] = best
+        argmax[v, c] = of_best
 
     @wp.kernel(enable_backward=False, module=module)
     def backward(
@@ -235,25 +390,42 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         weight: wp.array2d(dtype=vec),
         order: wp.array(dtype=wp.int64),
         starts: wp.array(dtype=wp.int64),
+        voxel: wp.array(dtype=wp.int64),
+        size: int,
         argmax: wp.array2d(dtype=int_vec),
         relu: int,
         grad_features: wp.array2d(dtype=vec),
         grad_weight: wp.array3d(dtype=vec),
     ):
-        """The gradient of the features, and for a block of voxels that of the layer: one loop, in a fixed order."""
+        """The gradient of the features, and for a block that of the layer: one loop, in a fixed order.
+
+        A block has `size` points, or VOXELS voxels where the size is 0.
+        """
         block, c = wp.tid()
-        w0, w1, w2, w3 = weight[0, c], weight[1, c], weight[2, c], weight[3, c]
-        scale, shift = weight[9, c], weight[10, c]
+        share = wp.vec4i(0, points.shape[0], block * VOXELS, wp.min((block + 1) * VOXELS, mean.shape[0]))
+        if size > 0:
+            share = share_of(block, size, points.shape[0], mean.shape[0], voxel, order, starts)
+        w0 = weight[0, c]
+        w1 = weight[1, c]
+        w2 = weight[2, c]
+        w3 = weight[3, c]
+        w4 = weight[4, c]
+        w5 = weight[5, c]
+        w6 = weight[6, c]
+        w7 = weight[7, c]
+        w8 = weight[8, c]
+        scale = weight[9, c]
+        shift = weight[10, c]
         g0, g1, g2, g3 = vec(), vec(), vec(), vec()
         g4, g5, g6, g7, g8 = vec(), vec(), vec(), vec(), vec()
         g9, g10 = vec(), vec()
-        for voxel in range(block * VOXELS, wp.min((block + 1) * VOXELS, mean.shape[0])):
-            centre = mean[voxel]
-            shared = of_voxel(weight, c, centre)
-            given = grad_values[voxel, c]
-            at = argmax[voxel, c]
+        for v in range(share[2], share[3]):
+            centre = mean[v]
+            shared = of_voxel(w4, w5, w6, w7, w8, centre)
+            given = grad_values[v, c]
+            of_best = argmax[v, c]
             total = vec()
-            for k in range(int(starts[voxel]), int(starts[voxel + 1])):
+            for k in range(wp.max(int(starts[v]), share[0]), wp.min(int(starts[v + 1]), share[1])):
                 i = point_at(order, k)
                 p = points[i]
                 attention = shared + of_point(w0, w1, w2, w3, p, centre)
@@ -263,7 +435,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
                 if grad_product.shape[0] > 0:
                     taken = grad_product[i, c]
                 for lane in range(lanes):
-                    if at[lane] == i:
+                    if of_best[lane] == i:
                         taken[lane] = taken[lane] + given[lane]
                 to_row = taken
                 to_attention = taken
@@ -303,37 +475,6 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         grad_weight[block, 10, c] = g10
 
     @wp.kernel(enable_backward=False, module=module)
-    def encode(
-        features: wp.array2d(dtype=vec),
-        points: wp.array(dtype=point),
-        mean: wp.array(dtype=point),
-        weight: wp.array2d(dtype=vec),
-        starts: wp.array(dtype=wp.int64),
-        counts: wp.array(dtype=wp.int64),
-        relu: int,
-        column: int,
-        product: wp.array2d(dtype=vec),
-        values: wp.array2d(dtype=vec),
-    ):
-        """`forward` for inference: M goes into columns of H, no arg-max; voxels beyond the count are left out."""
-        voxel, c = wp.tid()
-        if wp.int64(voxel) >= counts[0]:
-            return
-        centre = mean[voxel]
-        shared = of_voxel(weight, c, centre)
-        w0, w1, w2, w3 = weight[0, c], weight[1, c], weight[2, c], weight[3, c]
-        start = int(starts[voxel])
-        best = vec()
-        for i in range(start, int(starts[voxel + 1])):
-            attention = shared + of_point(w0, w1, w2, w3, points[i], centre)
-            row = attended(features[i, c], attention, relu)
-            product[i, column + c] = row
-            if i == start:
-                best = row
-            best = wp.max(best, row)
-        values[voxel, c] = best
-
-    @wp.kernel(enable_backward=False, module=module)
     def sums(rows: wp.array2d(dtype=vec), total: wp.array2d(dtype=wide), squares: wp.array2d(dtype=wide)):
         block, c = wp.tid()
         a = wide()
@@ -349,73 +490,185 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
 
     return SimpleNamespace(
         forward=forward,
+        forward_of_chunk=forward_of_chunk,
+        forward_join=forward_join,
         backward=backward,
-        encode=encode,
         sums=sums,
-        of_voxel=of_voxel,
-        of_point=of_point,
-        attended=attended,
     )
 
 
 @functools.cache
-def _project_kernel(lanes: int, image_dtype: Any) -> wp.Kernel:
-    """The kernel from features to a pseudo-image of one floating type."""
+def _inference_kernels(lanes: int, image_dtype: Any) -> SimpleNamespace:
+    """`forward` without arg-max, for G' or a pseudo-image of one floating type."""
     vec = wp.types.vector(length=lanes, dtype=wp.float32)
     pixel = wp.types.vector(length=lanes, dtype=image_dtype)
-    kernels = _kernels(wp.float32, lanes)
-    of_voxel, of_point, attended = kernels.of_voxel, kernels.of_point, kernels.attended
+    functions = _functions(wp.float32, lanes)
+    of_voxel, of_point, attended = functions.of_voxel, functions.of_point, functions.attended
+    module = wp.Module(f"hvnet_inference_{image_dtype.__name__}_{lanes}", None)
 
-    @wp.kernel(enable_backward=False, module=wp.Module(f"hvnet_project_{image_dtype.__name__}_{lanes}", None))
-    def project(
+    @wp.func
+    def rounded(best: vec):
+        narrow = pixel()
+        for lane in range(lanes):
+            narrow[lane] = image_dtype(best[lane])
+        return narrow
+
+    @wp.func
+    def row_of(cursor: wp.array(dtype=wp.int64), v: int):
+        """The row of a voxel in what is written: its cell in an image, or its own number."""
+        row = v
+        if cursor.shape[0] > 0:
+            row = int(cursor[v])
+        return row
+
+    @wp.kernel(enable_backward=False, module=module)
+    def encode(
+        starts: wp.array(dtype=wp.int64),
+        voxel: wp.array(dtype=wp.int64),
+        order: wp.array(dtype=wp.int64),
+        kept: wp.array(dtype=wp.int64),
+        cursor: wp.array(dtype=wp.int64),
+        size: int,
+        ends: wp.array3d(dtype=vec),
+        values: wp.array2d(dtype=pixel),
         features: wp.array2d(dtype=vec),
         points: wp.array(dtype=wp.vec4),
         mean: wp.array(dtype=wp.vec4),
         weight: wp.array2d(dtype=vec),
-        starts: wp.array(dtype=wp.int64),
-        counts: wp.array(dtype=wp.int64),
-        cursor: wp.array(dtype=wp.int64),
         relu: int,
-        image: wp.array2d(dtype=pixel),
+        column: int,
+        product: wp.array2d(dtype=vec),
     ):
-        voxel, c = wp.tid()
-        if wp.int64(voxel) >= counts[0]:
+        """M goes into columns of the product, if there is one; a task has `size` points, and every voxel has some."""
+        task, c = wp.tid()
+        first = task * size
+        last = wp.min(first + size, int(kept[0]))
+        if first >= last:
             return
-        centre = mean[voxel]
-        shared = of_voxel(weight, c, centre)
-        w0, w1, w2, w3 = weight[0, c], weight[1, c], weight[2, c], weight[3, c]
-        start = int(starts[voxel])
-        best = vec()
-        for i in range(start, int(starts[voxel + 1])):
-            attention = shared + of_point(w0, w1, w2, w3, points[i], centre)
-            row = attended(features[i, c], attention, relu)
-            if i == start:
-                best = row
-            best = wp.max(best, row)
-        rounded = pixel()
-        for lane in range(lanes):
-            rounded[lane] = image_dtype(best[lane])
-        image[int(cursor[voxel]), c] = rounded
+        w0 = weight[0, c]
+        w1 = weight[1, c]
+        w2 = weight[2, c]
+        w3 = weight[3, c]
+        w4 = weight[4, c]
+        w5 = weight[5, c]
+        w6 = weight[6, c]
+        w7 = weight[7, c]
+        w8 = weight[8, c]
+        for v in range(int(voxel[first]), int(voxel[last - 1]) + 1):
+            begin, end = int(starts[v]), int(starts[v + 1])
+            centre = mean[v]
+            shared = of_voxel(w4, w5, w6, w7, w8, centre)
+            best = vec(-wp.inf)
+            for k in range(wp.max(begin, first), wp.min(end, last)):
+                attention = shared + of_point(w0, w1, w2, w3, points[k], centre)
+                row = attended(features[k, c], attention, relu)
+                if product.shape[0] > 0:
+                    product[k, column + c] = row
+                best = wp.max(best, row)
+            if begin < first:
+                ends[0, task, c] = best
+            elif end > last:
+                ends[1, task, c] = best
+            else:
+                values[row_of(cursor, v), c] = rounded(best)
 
-    return project
+    @wp.kernel(enable_backward=False, module=module)
+    def join(
+        starts: wp.array(dtype=wp.int64),
+        voxel: wp.array(dtype=wp.int64),
+        order: wp.array(dtype=wp.int64),
+        kept: wp.array(dtype=wp.int64),
+        cursor: wp.array(dtype=wp.int64),
+        size: int,
+        ends: wp.array3d(dtype=vec),
+        values: wp.array2d(dtype=pixel),
+    ):
+        task, c = wp.tid()
+        v = cut_voxel(task, size, int(kept[0]), voxel, order, starts)
+        if v < 0:
+            return
+        best = ends[1, task, c]
+        k = task + 1
+        while k * size < int(starts[v + 1]):
+            best = wp.max(best, ends[0, k, c])
+            k += 1
+        values[row_of(cursor, v), c] = rounded(best)
+
+    return SimpleNamespace(encode=encode, join=join)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _sums(
+    points: wp.array(dtype=wp.vec4),
+    starts: wp.array2d(dtype=wp.int64),
+    voxel: wp.array2d(dtype=wp.int64),
+    counts: wp.array(dtype=wp.int64),
+    finest: int,
+    size: int,
+    ends: wp.array2d(dtype=wp.vec4d),
+    sums: wp.array(dtype=wp.vec4d),
+    means: wp.array2d(dtype=wp.vec4),
+):
+    """Sums of the points of every voxel of the finest scale."""
+    task = wp.tid()
+    first = task * size
+    last = wp.min(first + size, int(counts[starts.shape[0]]))
+    if first >= last:
+        return
+    for v in range(int(voxel[finest, first]), int(voxel[finest, last - 1]) + 1):
+        begin, end = int(starts[finest, v]), int(starts[finest, v + 1])
+        total = wp.vec4d()
+        for k in range(wp.max(begin, first), wp.min(end, last)):
+            total += wp.vec4d(points[k])
+        if begin < first:
+            ends[0, task] = total
+        elif end > last:
+            ends[1, task] = total
+        else:
+            sums[v] = total
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _sums_join(
+    starts: wp.array2d(dtype=wp.int64),
+    voxel: wp.array2d(dtype=wp.int64),
+    counts: wp.array(dtype=wp.int64),
+    finest: int,
+    size: int,
+    ends: wp.array2d(dtype=wp.vec4d),
+    sums: wp.array(dtype=wp.vec4d),
+    means: wp.array2d(dtype=wp.vec4),
+):
+    task = wp.tid()
+    v = cut_voxel(task, size, int(counts[starts.shape[0]]), voxel[finest], voxel[finest, 0:0], starts[finest])
+    if v < 0:
+        return
+    total = ends[1, task]
+    k = task + 1
+    while k * size < int(starts[finest, v + 1]):
+        total += ends[0, k]
+        k += 1
+    sums[v] = total
 
 
 @wp.kernel(enable_backward=False, module="unique")
 def _means(
-    points: wp.array(dtype=wp.vec4),
-    starts: wp.array(dtype=wp.int64),
+    starts: wp.array2d(dtype=wp.int64),
+    voxel: wp.array2d(dtype=wp.int64),
     counts: wp.array(dtype=wp.int64),
-    mean: wp.array(dtype=wp.vec4),
+    finest: int,
+    sums: wp.array(dtype=wp.vec4d),
+    means: wp.array2d(dtype=wp.vec4),
 ):
-    voxel = wp.tid()
-    if wp.int64(voxel) >= counts[0]:
+    s, v = wp.tid()
+    if wp.int64(v) >= counts[s]:
         return
-    start, end = int(starts[voxel]), int(starts[voxel + 1])
+    start, end = int(starts[s, v]), int(starts[s, v + 1])
     total = wp.vec4d()
-    for i in range(start, end):
-        total += wp.vec4d(points[i])
+    for child in range(int(voxel[finest, start]), int(voxel[finest, end - 1]) + 1):
+        total += sums[child]
     # rounded to float32 before the division, as segment_mean does
-    mean[voxel] = wp.vec4(total) / float(end - start)
+    means[s, v] = wp.vec4(total) / float(end - start)
 
 
 @functools.cache
@@ -424,7 +677,8 @@ def _context_kernel(lanes: int) -> wp.Kernel:
 
     @wp.kernel(enable_backward=False, module=wp.Module(f"hvnet_context_{lanes}", None))
     def context(
-        of_voxels: wp.array3d(dtype=vec),
+        of_voxels: wp.array2d(dtype=vec),
+        rows: int,
         voxel: wp.array2d(dtype=wp.int64),
         kept: wp.array(dtype=wp.int64),
         features: wp.array2d(dtype=vec),
@@ -434,8 +688,8 @@ def _context_kernel(lanes: int) -> wp.Kernel:
         if wp.int64(i) >= kept[0]:
             return
         total = features[i, c]
-        for s in range(of_voxels.shape[0]):
-            total += of_voxels[s, int(voxel[s, i]), c]
+        for s in range(voxel.shape[0]):
+            total += of_voxels[s * rows + int(voxel[s, i]), c]
         features[i, c] = total
 
     return context
@@ -459,6 +713,7 @@ def _attend_outputs(
     points: Tensor,
     mean: Tensor,
     layer: Tensor,
+    voxel: Tensor,
     order: Tensor | None,
     starts: Tensor,
     relu: bool,
@@ -476,25 +731,27 @@ def _attend(
     points: Tensor,
     mean: Tensor,
     layer: Tensor,
+    voxel: Tensor,
     order: Tensor | None,
     starts: Tensor,
     relu: bool,
     keep: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     count, lanes = features.shape[1], lanes_of(features.shape[1], features.device)
-    outputs = _attend_outputs(features, points, mean, layer, order, starts, relu, keep)
-    inputs = [
-        channels(features.contiguous(), lanes),
-        array(points.contiguous(), 4),
-        array(mean.contiguous(), 4),
-        channels(layer.contiguous(), lanes),
-        array(starts.new_empty(0) if order is None else order.contiguous()),
-        array(starts.contiguous()),
-        int(relu),
-        *(channels(output, lanes) for output in outputs),
-    ]
-    kernel = _kernels(WARP_FLOAT[features.dtype], lanes).forward
-    launch(kernel, (mean.shape[0], count // lanes), inputs, features.device)
+    outputs = _attend_outputs(features, points, mean, layer, voxel, order, starts, relu, keep)
+    division = [order_array(order, starts), array(starts.contiguous())]
+    results = [channels(output, lanes) for output in outputs]
+    inputs = [channels(features.contiguous(), lanes), array(points.contiguous(), 4), array(mean.contiguous(), 4)]
+    inputs += [channels(layer.contiguous(), lanes), *division, int(relu), *results]
+    kernels = _kernels(WARP_FLOAT[features.dtype], lanes)
+    if many_threads(features.device):
+        tasks = tasks_of(CHUNK, len(points))
+        ends = [ends_of(tasks, features), ends_of(tasks, features, torch.int32)]
+        cut = [array(voxel.contiguous()), *(channels(each, lanes) for each in ends)]
+        launch(kernels.forward_of_chunk, (tasks, count // lanes), [*inputs, *cut], features.device)
+        launch(kernels.forward_join, (tasks, count // lanes), [*division, *results[1:], *cut], features.device)
+    else:
+        launch(kernels.forward, (len(mean), count // lanes), inputs, features.device)
     return outputs
 
 
@@ -508,6 +765,7 @@ def _attend_backward_outputs(
     points: Tensor,
     mean: Tensor,
     layer: Tensor,
+    voxel: Tensor,
     order: Tensor | None,
     starts: Tensor,
     argmax: Tensor,
@@ -524,15 +782,17 @@ def _attend_backward(
     points: Tensor,
     mean: Tensor,
     layer: Tensor,
+    voxel: Tensor,
     order: Tensor | None,
     starts: Tensor,
     argmax: Tensor,
     relu: bool,
 ) -> tuple[Tensor, Tensor]:
     count, lanes = features.shape[1], lanes_of(features.shape[1], features.device)
-    blocks = -(-mean.shape[0] // VOXELS)
+    size = CHUNK if many_threads(features.device) else 0
+    blocks = tasks_of(size, len(points)) if size else -(-len(mean) // VOXELS)
     grad_features, grad_layer = _attend_backward_outputs(
-        grad_product, grad_values, features, points, mean, layer, order, starts, argmax, relu
+        grad_product, grad_values, features, points, mean, layer, voxel, order, starts, argmax, relu
     )
     of_blocks = features.new_empty(blocks, LAYER, count)
     given = features.new_empty(0, count) if grad_product is None else grad_product.contiguous()
@@ -543,8 +803,10 @@ def _attend_backward(
         array(points.contiguous(), 4),
         array(mean.contiguous(), 4),
         channels(layer.contiguous(), lanes),
-        array(starts.new_empty(0) if order is None else order.contiguous()),
+        order_array(order, starts),
         array(starts.contiguous()),
+        array(voxel.contiguous()),
+        size,
         channels(argmax.contiguous(), lanes),
         int(relu),
         channels(grad_features, lanes),
@@ -566,14 +828,14 @@ def _save(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> Non
 
 
 def _backward(ctx: Any, grad_product: Tensor | None, grad_values: Tensor | None, _: Any) -> tuple[Tensor | None, ...]:
-    features, points, mean, layer, order, starts, argmax = ctx.saved_tensors
+    features, points, mean, layer, voxel, order, starts, argmax = ctx.saved_tensors
     if grad_values is None:
         grad_values = features.new_zeros(mean.shape[0], features.shape[1])
     given = grad_product if ctx.keep else None
     grad_features, grad_layer = _attend_backward(
-        given, grad_values, features, points, mean, layer, order, starts, argmax, ctx.relu
+        given, grad_values, features, points, mean, layer, voxel, order, starts, argmax, ctx.relu
     )
-    return grad_features, None, None, grad_layer, None, None, None, None
+    return grad_features, None, None, grad_layer, None, None, None, None, None
 
 
 _attend.register_autograd(_backward, setup_context=_save)

@@ -77,9 +77,8 @@ def array(tensor: Tensor, lanes: int = 0) -> Any:
 
 
 def channels(tensor: Tensor, lanes: int) -> Any:
-    """A Warp view (N, C / lanes) of vectors over a contiguous channels-last tensor (N, C)."""
-    rows, count = tensor.shape
-    return array(tensor.view(rows, count // lanes, lanes), lanes)
+    """A Warp view (.., C / lanes) of vectors over a contiguous channels-last tensor (.., C)."""
+    return array(tensor.view(*tensor.shape[:-1], tensor.shape[-1] // lanes, lanes), lanes)
 
 
 def lanes_of(count: int, device: torch.device) -> int:
@@ -140,6 +139,10 @@ def check_index(name: str, index: Tensor, size: int) -> None:
     """Checks that every value of an index tensor is in [0, size); reads the device once."""
     if index.numel() == 0:
         return
-    low, high = (int(value) for value in torch.stack(torch.aminmax(index)).tolist())
+    check_bounds(name, *torch.stack(torch.aminmax(index)).tolist(), size)
+
+
+def check_bounds(name: str, low: int, high: int, size: int) -> None:
+    """Checks that the least and the largest value of an index are in [0, size)."""
     if low < 0 or high >= size:
         raise ValueError(f"{name}: want values in [0, {size}), got {low} to {high}")

@@ -1,8 +1,9 @@
 """Scatter and gather between points and voxels (Sec. "Efficient Index-based Implementation"), with gradients.
 
-An index is turned into segments, the points of each voxel one after the other, and every kernel is one loop a
-segment: no atomics, a fixed order, hence the same bits on every run and on every device. Features are channels-last,
-and the loops run over vectors of channels.
+An index is turned into segments, the points of each voxel one after the other. One thread goes through voxel after
+voxel; of many each takes as many consecutive points, however long the voxels are, and a second kernel joins what of a
+voxel was cut. There are no atomics and the order is fixed: the same bits on every run, and maxima, arg-max and integers
+are the same on a CPU and on a GPU. Features are channels-last, and on a CPU the loops run over vectors of channels.
 """
 
 # inside a kernel Warp's types are calls, and its tensors have no types that mypy knows
@@ -25,6 +26,7 @@ from hvnet.kernels.launch import (
     check_tensor,
     lanes_of,
     launch,
+    many_threads,
 )
 
 
@@ -102,40 +104,96 @@ def _segments_of(src: Tensor, index: Tensor, dim_size: int) -> Segments:
     return segments(index, dim_size)
 
 
+CHUNK = wp.constant(32)
+"""Consecutive points that one of many threads takes."""
+
+
+@wp.func
+def point_at(order: wp.array(dtype=wp.int64), k: int):
+    """The k-th point in the order of the voxels; an empty order is that of the points."""
+    i = k
+    if order.shape[0] > 0:
+        i = int(order[k])
+    return i
+
+
+@wp.func
+def share_of(
+    task: int,
+    size: int,
+    count: int,
+    voxels: int,
+    voxel: wp.array(dtype=wp.int64),
+    order: wp.array(dtype=wp.int64),
+    starts: wp.array(dtype=wp.int64),
+):
+    """A task's `size` of `count` points: from, to; and its voxels: from, to. Ends are not included.
+
+    Voxels without points belong to the task of the next point, those after the last point to the last task.
+    """
+    first = task * size
+    last = wp.min(first + size, count)
+    share = wp.vec4i(first, last, 0, voxels)
+    if first >= last and task > 0:
+        share = wp.vec4i(0, 0, 0, 0)
+    elif first < last:
+        begin = int(0)
+        end = voxels
+        if task > 0:
+            begin = wp.min(int(voxel[point_at(order, first - 1)]) + 1, int(voxel[point_at(order, first)]))
+        if last < count:
+            end = int(voxel[point_at(order, last - 1)]) + 1
+        share = wp.vec4i(first, last, begin, end)
+    return share
+
+
+@wp.func
+def cut_voxel(
+    task: int,
+    size: int,
+    count: int,
+    voxel: wp.array(dtype=wp.int64),
+    order: wp.array(dtype=wp.int64),
+    starts: wp.array(dtype=wp.int64),
+):
+    """The voxel that begins in a task's share and goes on beyond it; -1 if there is none."""
+    cut = int(-1)
+    last = (task + 1) * size
+    if last < count:
+        v = int(voxel[point_at(order, last - 1)])
+        if int(starts[v]) >= task * size and int(starts[v + 1]) > last:
+            cut = v
+    return cut
+
+
+def tasks_of(size: int, points: int) -> int:
+    """The tasks that share the points, one at least: voxels without points are its work as well."""
+    return max(1, -(-points // size))
+
+
+def ends_of(tasks: int, like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+    """Room (2, tasks, C) for what a task finds of a voxel that began before it, and of one that goes on after it."""
+    return like.new_empty(2, tasks, like.shape[1], dtype=dtype)
+
+
 @functools.cache
 def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
     """The kernels for one floating type and vector length, in a module of their own."""
     vec = wp.types.vector(length=lanes, dtype=dtype)
     int_vec = wp.types.vector(length=lanes, dtype=wp.int32)  # as wide as float32: the lanes stay in step
-    sums = wp.types.vector(length=lanes, dtype=wp.float64)
+    wide = wp.types.vector(length=lanes, dtype=wp.float64)
     module = wp.Module(f"hvnet_scatter_{dtype.__name__}_{lanes}", None)
 
     @wp.func
-    def point_at(order: wp.array(dtype=wp.int64), k: int):
-        i = k
-        if order.shape[0] > 0:
-            i = int(order[k])
-        return i
-
-    @wp.kernel(enable_backward=False, module=module)
-    def maximum(
-        src: wp.array2d(dtype=vec),
-        order: wp.array(dtype=wp.int64),
-        starts: wp.array(dtype=wp.int64),
-        values: wp.array2d(dtype=vec),
-        argmax: wp.array2d(dtype=int_vec),
-    ):
-        voxel, c = wp.tid()
-        start = int(starts[voxel])
-        end = int(starts[voxel + 1])
+    def largest_of(src: wp.array2d(dtype=vec), order: wp.array(dtype=wp.int64), begin: int, end: int, c: int):
         best = vec()
         of_best = int_vec(src.shape[0])
-        if start < end:
-            i = point_at(order, start)
+        if begin < end:
+            i = point_at(order, begin)
             best = src[i, c]
             of_best = int_vec(i)
         nonfinite = best - best  # stays 0 unless a value is not finite
-        for k in range(start + 1, end):
+        for k in range(begin + 1, end):
             i = point_at(order, k)
             row = src[i, c]
             nonfinite += row - row
@@ -145,8 +203,80 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
                     of_best[lane] = i
         if wp.dot(nonfinite, nonfinite) != dtype(0.0):
             of_best = int_vec(-1)  # left to maximum_with_nan: its branches would slow down this loop fourfold
-        values[voxel, c] = best
-        argmax[voxel, c] = of_best
+        return best, of_best
+
+    @wp.kernel(enable_backward=False, module=module)
+    def maximum(
+        src: wp.array2d(dtype=vec),
+        order: wp.array(dtype=wp.int64),
+        starts: wp.array(dtype=wp.int64),
+        values: wp.array2d(dtype=vec),
+        argmax: wp.array2d(dtype=int_vec),
+    ):
+        v, c = wp.tid()
+        best, of_best = largest_of(src, order, int(starts[v]), int(starts[v + 1]), c)
+        values[v, c] = best
+        argmax[v, c] = of_best
+
+    @wp.kernel(enable_backward=False, module=module)
+    def maximum_of_chunk(
+        src: wp.array2d(dtype=vec),
+        order: wp.array(dtype=wp.int64),
+        starts: wp.array(dtype=wp.int64),
+        voxel: wp.array(dtype=wp.int64),
+        ends: wp.array3d(dtype=vec),
+        ends_argmax: wp.array3d(dtype=int_vec),
+        values: wp.array2d(dtype=vec),
+        argmax: wp.array2d(dtype=int_vec),
+    ):
+        task, c = wp.tid()
+        share = share_of(task, CHUNK, src.shape[0], values.shape[0], voxel, order, starts)
+        first, last = share[0], share[1]
+        for v in range(share[2], share[3]):
+            begin, end = int(starts[v]), int(starts[v + 1])
+            best, of_best = largest_of(src, order, wp.max(begin, first), wp.min(end, last), c)
+            if begin < first:
+                ends[0, task, c] = best
+                ends_argmax[0, task, c] = of_best
+            elif end > last:
+                ends[1, task, c] = best
+                ends_argmax[1, task, c] = of_best
+            else:
+                values[v, c] = best
+                argmax[v, c] = of_best
+
+    @wp.kernel(enable_backward=False, module=module)
+    def maximum_join(
+        src: wp.array2d(dtype=vec),
+        order: wp.array(dtype=wp.int64),
+        starts: wp.array(dtype=wp.int64),
+        voxel: wp.array(dtype=wp.int64),
+        ends: wp.array3d(dtype=vec),
+        ends_argmax: wp.array3d(dtype=int_vec),
+        values: wp.array2d(dtype=vec),
+        argmax: wp.array2d(dtype=int_vec),
+    ):
+        task, c = wp.tid()
+        v = cut_voxel(task, CHUNK, src.shape[0], voxel, order, starts)
+        if v < 0:
+            return
+        best = ends[1, task, c]
+        of_best = ends_argmax[1, task, c]
+        lowest = of_best  # below 0 if a part was left to maximum_with_nan
+        k = task + 1
+        while k * CHUNK < int(starts[v + 1]):
+            row = ends[0, k, c]
+            of_row = ends_argmax[0, k, c]
+            lowest = wp.min(lowest, of_row)
+            for lane in range(lanes):
+                if row[lane] >= best[lane]:
+                    best[lane] = row[lane]
+                    of_best[lane] = of_row[lane]
+            k += 1
+        if wp.min(lowest) < 0:
+            of_best = int_vec(-1)
+        values[v, c] = best
+        argmax[v, c] = of_best
 
     @wp.kernel(enable_backward=False, module=module)
     def maximum_with_nan(
@@ -191,6 +321,23 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
                 taken[lane] = given[lane]
         grad_src[i, c] = taken
 
+    @wp.func
+    def sum_of(src: wp.array2d(dtype=vec), order: wp.array(dtype=wp.int64), begin: int, end: int, c: int):
+        # in float64: a million float32 summed one by one would be off by a hundredth
+        value = wide()
+        for k in range(begin, end):
+            row = src[point_at(order, k), c]
+            for lane in range(lanes):
+                value[lane] = value[lane] + wp.float64(row[lane])
+        return value
+
+    @wp.func
+    def rounded(value: wide):
+        narrow = vec()
+        for lane in range(lanes):
+            narrow[lane] = dtype(value[lane])
+        return narrow
+
     @wp.kernel(enable_backward=False, module=module)
     def total(
         src: wp.array2d(dtype=vec),
@@ -198,17 +345,50 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         starts: wp.array(dtype=wp.int64),
         values: wp.array2d(dtype=vec),
     ):
-        voxel, c = wp.tid()
-        # in float64: a million float32 summed one by one would be off by a hundredth
-        value = sums()
-        for k in range(int(starts[voxel]), int(starts[voxel + 1])):
-            row = src[point_at(order, k), c]
-            for lane in range(lanes):
-                value[lane] = value[lane] + wp.float64(row[lane])
-        rounded = vec()
-        for lane in range(lanes):
-            rounded[lane] = dtype(value[lane])
-        values[voxel, c] = rounded
+        v, c = wp.tid()
+        values[v, c] = rounded(sum_of(src, order, int(starts[v]), int(starts[v + 1]), c))
+
+    @wp.kernel(enable_backward=False, module=module)
+    def total_of_chunk(
+        src: wp.array2d(dtype=vec),
+        order: wp.array(dtype=wp.int64),
+        starts: wp.array(dtype=wp.int64),
+        voxel: wp.array(dtype=wp.int64),
+        ends: wp.array3d(dtype=wide),
+        values: wp.array2d(dtype=vec),
+    ):
+        task, c = wp.tid()
+        share = share_of(task, CHUNK, src.shape[0], values.shape[0], voxel, order, starts)
+        first, last = share[0], share[1]
+        for v in range(share[2], share[3]):
+            begin, end = int(starts[v]), int(starts[v + 1])
+            value = sum_of(src, order, wp.max(begin, first), wp.min(end, last), c)
+            if begin < first:
+                ends[0, task, c] = value
+            elif end > last:
+                ends[1, task, c] = value
+            else:
+                values[v, c] = rounded(value)
+
+    @wp.kernel(enable_backward=False, module=module)
+    def total_join(
+        src: wp.array2d(dtype=vec),
+        order: wp.array(dtype=wp.int64),
+        starts: wp.array(dtype=wp.int64),
+        voxel: wp.array(dtype=wp.int64),
+        ends: wp.array3d(dtype=wide),
+        values: wp.array2d(dtype=vec),
+    ):
+        task, c = wp.tid()
+        v = cut_voxel(task, CHUNK, src.shape[0], voxel, order, starts)
+        if v < 0:
+            return
+        value = ends[1, task, c]
+        k = task + 1
+        while k * CHUNK < int(starts[v + 1]):
+            value += ends[0, k, c]
+            k += 1
+        values[v, c] = rounded(value)
 
     @wp.kernel(enable_backward=False, module=module)
     def gather_add(
@@ -223,13 +403,18 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
     return SimpleNamespace(
         gather_add=gather_add,
         maximum=maximum,
+        maximum_of_chunk=maximum_of_chunk,
+        maximum_join=maximum_join,
         maximum_with_nan=maximum_with_nan,
         maximum_backward=maximum_backward,
         total=total,
+        total_of_chunk=total_of_chunk,
+        total_join=total_join,
     )
 
 
-def _order_array(order: Tensor | None, like: Tensor) -> Any:
+def order_array(order: Tensor | None, like: Tensor) -> Any:
+    """A Warp view of an order (N,), empty where the points are in order already."""
     return array(like.new_empty(0) if order is None else order.contiguous())
 
 
@@ -260,11 +445,18 @@ def _segment_max_outputs(src: Tensor, index: Tensor, order: Tensor | None, start
 def _segment_max(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> tuple[Tensor, Tensor]:
     count, lanes = src.shape[1], lanes_of(src.shape[1], src.device)
     values, argmax = _segment_max_outputs(src, index, order, starts)
-    inputs = [channels(src.contiguous(), lanes), _order_array(order, starts), array(starts.contiguous())]
-    inputs += [channels(values, lanes), channels(argmax, lanes)]
     kernels = _kernels(WARP_FLOAT[src.dtype], lanes)
-    launch(kernels.maximum, (values.shape[0], count // lanes), inputs, src.device)
-    launch(kernels.maximum_with_nan, (values.shape[0], count // lanes), inputs, src.device)
+    inputs = [channels(src.contiguous(), lanes), order_array(order, starts), array(starts.contiguous())]
+    outputs = [channels(values, lanes), channels(argmax, lanes)]
+    if many_threads(src.device):
+        tasks = tasks_of(CHUNK, len(src))
+        ends = ends_of(tasks, src), ends_of(tasks, src, torch.int32)
+        chunked = [*inputs, array(index.contiguous()), *(channels(each, lanes) for each in ends), *outputs]
+        for kernel in (kernels.maximum_of_chunk, kernels.maximum_join):
+            launch(kernel, (tasks, count // lanes), chunked, src.device)
+    else:
+        launch(kernels.maximum, (len(values), count // lanes), [*inputs, *outputs], src.device)
+    launch(kernels.maximum_with_nan, (len(values), count // lanes), [*inputs, *outputs], src.device)
     return values, argmax
 
 
@@ -297,9 +489,16 @@ def _segment_sum_outputs(src: Tensor, index: Tensor, order: Tensor | None, start
 def _segment_sum(src: Tensor, index: Tensor, order: Tensor | None, starts: Tensor) -> Tensor:
     count, lanes = src.shape[1], lanes_of(src.shape[1], src.device)
     values = _segment_sum_outputs(src, index, order, starts)
-    inputs = [channels(src.contiguous(), lanes), _order_array(order, starts), array(starts.contiguous())]
-    inputs += [channels(values, lanes)]
-    launch(_kernels(WARP_FLOAT[src.dtype], lanes).total, (values.shape[0], count // lanes), inputs, src.device)
+    kernels = _kernels(WARP_FLOAT[src.dtype], lanes)
+    inputs = [channels(src.contiguous(), lanes), order_array(order, starts), array(starts.contiguous())]
+    if many_threads(src.device):
+        tasks = tasks_of(CHUNK, len(src))
+        ends = channels(ends_of(tasks, src, torch.float64), lanes)
+        inputs += [array(index.contiguous()), ends, channels(values, lanes)]
+        for kernel in (kernels.total_of_chunk, kernels.total_join):
+            launch(kernel, (tasks, count // lanes), inputs, src.device)
+    else:
+        launch(kernels.total, (len(values), count // lanes), [*inputs, channels(values, lanes)], src.device)
     return values
 
 

@@ -12,12 +12,13 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from hvnet.kernels.launch import array, check_index, check_tensor, launch, many_threads
+from hvnet.kernels.launch import array, check_bounds, check_index, check_tensor, launch, many_threads
 from hvnet.kernels.scatter import Segments, segments
 
 KEY_BITS = 31  # of a sort key: it shares an int64 with the number of its point
 DIGIT_BITS = wp.constant(11)  # of a pass of the radix sort
 DIGITS = wp.constant(1 << 11)
+KEYS = wp.constant(1 << KEY_BITS)
 OUTSIDE = wp.constant(1 << 62)  # the key of a point outside, after all others
 
 
@@ -134,18 +135,21 @@ def voxel_index(points: Tensor, sample: Tensor, batch_size: int, grids: Sequence
 @torch.library.custom_op("hvnet::voxel_index", mutates_args=())
 def _voxel_index(points: Tensor, sample: Tensor, batch_size: int, flat: Sequence[float]) -> list[Tensor]:
     """Order, then cursor, voxel and starts of every scale, and its order where the scales do not nest."""
-    check_index("sample", sample, batch_size)
     grids = _grids(flat)
     for grid in grids:
         if batch_size * grid.shape[0] * grid.shape[1] >= 2**63:
             raise ValueError(f"grids: {batch_size} samples of {grid.shape} cells have cursors beyond int64")
     if is_nested(grids, batch_size):
         nested = nested_index(points, sample, grids)
-        *counts, kept = nested.counts.tolist()
+        bounds = torch.stack(torch.aminmax(sample)) if len(sample) else sample.new_zeros(2)
+        low, high, *counts, kept = torch.cat((bounds, nested.counts)).tolist()  # the one wait for the device
+        if len(sample):
+            check_bounds("sample", low, high, batch_size)
         parts = [nested.order[:kept].clone()]
         for s, v in enumerate(counts):
             parts += [nested.cursor[s, :v].clone(), nested.voxel[s, :kept].clone(), nested.starts[s, : v + 1].clone()]
         return parts
+    check_index("sample", sample, batch_size)
     by_scale = [cursors(points, sample, grid) for grid in grids]
     inside = by_scale[0].ge(0)
     for cursor in by_scale[1:]:
@@ -193,7 +197,7 @@ def nested_index(points: Tensor, sample: Tensor, grids: Sequence[Grid]) -> Neste
     inputs = [array(points.contiguous(), 4), array(sample.contiguous()), *of_grid]
     if not many_threads(device):
         return _serial_index(inputs, len(points), of_scales)
-    keys = torch.empty(len(points), dtype=torch.int64, device=device)
+    keys = torch.empty(len(points), dtype=torch.int32, device=device)
     launch(_key_kernel, len(points), [*inputs, array(keys)], device)
     return _parallel_index(keys, of_scales, bits)
 
@@ -218,13 +222,15 @@ def _parallel_index(keys: Tensor, of_scales: Tensor, bits: int) -> NestedIndex:
     """The index of points with these keys (N,), for many threads: a sort, a sum over the first points, a write."""
     count, scales = len(keys), len(of_scales)
     keys, order = torch.sort(keys, stable=True)
-    first = torch.empty(scales, count, dtype=torch.int64, device=keys.device)
+    first = torch.empty(scales, count, dtype=torch.int32, device=keys.device)
     launch(_first_kernel, first.shape, [array(keys), array(of_scales), array(first)], keys.device)
-    voxel = first.cumsum(dim=1) - 1
+    # one sum over all scales: torch gives a row of a sum along rows to one block of threads alone
+    numbers = first.view(-1).cumsum(0, dtype=torch.int32).view_as(first)
+    voxel, cursor = (torch.empty(scales, count, dtype=torch.int64, device=keys.device) for _ in range(2))
     starts = torch.zeros(scales, count + 1, dtype=torch.int64, device=keys.device)
-    cursor = torch.empty(scales, count, dtype=torch.int64, device=keys.device)
     counts = torch.zeros(scales + 1, dtype=torch.int64, device=keys.device)
-    inputs = [array(keys), array(of_scales), array(voxel), wp.int64(bits), array(starts), array(cursor), array(counts)]
+    inputs = [array(keys), array(of_scales), array(numbers), wp.int64(bits)]
+    inputs += [array(tensor) for tensor in (voxel, starts, cursor, counts)]
     launch(_fill_kernel, first.shape, inputs, keys.device)
     return NestedIndex(order, voxel, starts, cursor, counts)
 
@@ -373,43 +379,50 @@ def _key_kernel(
     reciprocal: wp.vec2,
     cells: wp.vec2i,
     bits: wp.int64,
-    keys: wp.array(dtype=wp.int64),
+    keys: wp.array(dtype=int),
 ):
+    """Keys of 31 bits as negative numbers, and 0 for a point outside: half as many bits to sort as in int64."""
     i = wp.tid()
-    keys[i] = _key(points, sample, i, low, height, reciprocal, cells, bits)
+    key = _key(points, sample, i, low, height, reciprocal, cells, bits)
+    keys[i] = int(wp.min(key - wp.int64(KEYS), wp.int64(0)))
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _first_kernel(
-    keys: wp.array(dtype=wp.int64), scales: wp.array2d(dtype=wp.int64), first: wp.array2d(dtype=wp.int64)
-):
+def _first_kernel(keys: wp.array(dtype=int), scales: wp.array2d(dtype=wp.int64), first: wp.array2d(dtype=int)):
     """1 for the first point of every voxel among the sorted keys."""
     s, i = wp.tid()
-    is_first = wp.int64(0)
-    if keys[i] != wp.int64(OUTSIDE) and (i == 0 or (keys[i] ^ keys[i - 1]) >> scales[s, 0] != wp.int64(0)):
-        is_first = wp.int64(1)
+    is_first = int(0)
+    if keys[i] < 0 and (i == 0 or (keys[i] ^ keys[i - 1]) >> int(scales[s, 0]) != 0):
+        is_first = 1
     first[s, i] = is_first
 
 
 @wp.kernel(enable_backward=False, module="unique")
 def _fill_kernel(
-    keys: wp.array(dtype=wp.int64),
+    keys: wp.array(dtype=int),
     scales: wp.array2d(dtype=wp.int64),
-    voxel: wp.array2d(dtype=wp.int64),
+    numbers: wp.array2d(dtype=int),
     bits: wp.int64,
+    voxel: wp.array2d(dtype=wp.int64),
     starts: wp.array2d(dtype=wp.int64),
     cursor: wp.array2d(dtype=wp.int64),
     counts: wp.array(dtype=wp.int64),
 ):
+    """The voxels of the sorted points, which are numbered on from scale to scale and from 1."""
     s, i = wp.tid()
-    if keys[i] == wp.int64(OUTSIDE):
+    if keys[i] >= 0:
         return
-    v = int(voxel[s, i])
-    if i == 0 or voxel[s, i] != voxel[s, i - 1]:
+    before = int(0)
+    if s > 0:
+        before = numbers[s - 1, keys.shape[0] - 1]
+    v = numbers[s, i] - before - 1
+    voxel[s, i] = wp.int64(v)
+    if i == 0 or numbers[s, i] != numbers[s, i - 1]:
         drop = scales[s, 0]
+        key = wp.int64(keys[i]) + wp.int64(KEYS)
         starts[s, v] = wp.int64(i)
-        cursor[s, v] = _cursor_of_key(keys[i] >> drop, bits - drop, scales[s, 1], scales[s, 2])
-    if i + 1 == keys.shape[0] or keys[i + 1] == wp.int64(OUTSIDE):
+        cursor[s, v] = _cursor_of_key(key >> drop, bits - drop, scales[s, 1], scales[s, 2])
+    if i + 1 == keys.shape[0] or keys[i + 1] >= 0:
         starts[s, v + 1] = wp.int64(i + 1)
         counts[s] = wp.int64(v + 1)
         if s == 0:

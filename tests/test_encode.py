@@ -162,10 +162,18 @@ def test_opcheck(device: torch.device) -> None:
     ops = torch.ops.hvnet
     for order in (at.order, None):
         for keep in (True, False):
-            torch.library.opcheck(ops.attend, (*inputs, order, at.starts, False, keep))
-    given = [tensor.detach() for tensor in (*ops.attend(*inputs, at.order, at.starts, True, True),)]
+            torch.library.opcheck(ops.attend, (*inputs, at.voxel, order, at.starts, False, keep))
+    given = [tensor.detach() for tensor in (*ops.attend(*inputs, at.voxel, at.order, at.starts, True, True),)]
     for grad_product in (given[0], None):
-        tensors = (grad_product, given[1], *(tensor.detach() for tensor in inputs), at.order, at.starts, given[2])
+        tensors = (
+            grad_product,
+            given[1],
+            *(tensor.detach() for tensor in inputs),
+            at.voxel,
+            at.order,
+            at.starts,
+            given[2],
+        )
         torch.library.opcheck(ops.attend_backward, (*tensors, True))
     rows = torch.randn(6, 5, device=device, requires_grad=True)
     torch.library.opcheck(ops.write_image, (rows, torch.tensor([5, 0, 3, 8, 1, 2], device=device), 9))

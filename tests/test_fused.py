@@ -44,7 +44,7 @@ def test_the_two_steps_of_the_fused_encoder_give_its_images() -> None:
     with torch.no_grad():
         images = parts.voxel_features(product, maxima, indexed, 2, torch.float32)
     assert product.shape == (len(indexed.points), len(SMALL.feature_scales) * SMALL.feature_channels)
-    assert [len(values) for values in maxima] == [indexed.scales[grid].rows for grid in encoder.feature_grids]
+    assert [len(values) for values in maxima] == [len(indexed.scales[grid].mean) for grid in encoder.feature_grids]
     for image, whole in zip(images, fused(points, sample, 2), strict=True):
         assert torch.equal(image, whole)
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hvnet.kernels import reference, voxel
+from hvnet.kernels import launch, reference, voxel
 
 INF, NAN = math.inf, math.nan
 RANGE = (0.0, -16.0, -3.0, 64.0, 16.0, 1.0)  # twice as long as wide, so that a transpose shows
@@ -447,23 +447,18 @@ def test_bad_hash_keys(device: torch.device) -> None:
 
 @pytest.mark.parametrize("scales", [[0.1], [0.1, 0.2, 0.4, 0.8], [0.4, 0.2]])
 @pytest.mark.parametrize("count", [0, 1, 5000])
-def test_one_thread_and_many_give_the_same_index(scales: list[float], count: int, device: torch.device) -> None:
-    """The CPU sorts and walks in one thread, a GPU in many: here the way of the GPU, from keys made by hand."""
+def test_one_thread_and_many_give_the_same_index(
+    scales: list[float], count: int, device: torch.device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also of points outside, and where the scales that follow each other are not in the order of their size."""
     grids = grids_of(scales)
-    finest = min(grids, key=lambda grid: grid.cell)
-    bits = voxel._bits(finest)
     points, sample = cloud(count), torch.arange(count) % 3
-    cursor = voxel.cursors(points, sample, finest)
-    n_l, n_w = finest.shape
-    keys = cursor // (n_l * n_w) << 2 * bits
-    for bit in range(bits):
-        keys |= (cursor // n_w % n_l >> bit & 1) << 2 * bit + 1 | (cursor % n_w >> bit & 1) << 2 * bit
+    cursor = voxel.cursors(points, sample, min(grids, key=lambda grid: grid.cell))
     for grid in grids:  # a coarser grid may reach further than the finest, none less far
         assert (voxel.cursors(points, sample, grid) >= 0)[cursor >= 0].all()
-    keys[cursor < 0] = 1 << 62
-    _, of_scales, key_bits = voxel._nesting(tuple(grids), device)
-    parallel = voxel._parallel_index(keys.to(device), of_scales, key_bits)
     serial = voxel.nested_index(points, sample, grids)
+    monkeypatch.setattr(launch, "force_many_threads", True)
+    parallel = voxel.nested_index(points.to(device), sample.to(device), grids)
     assert torch.equal(serial.counts, parallel.counts.cpu())
     *voxels, kept = serial.counts.tolist()
     assert kept == int((cursor >= 0).sum())

@@ -13,7 +13,6 @@ from hvnet.kernels.encode import (
     encode_voxels,
     project_voxels,
     scales_of,
-    voxel_means,
 )
 from hvnet.kernels.launch import many_threads
 from hvnet.kernels.voxel import Grid, is_nested, nested_index
@@ -25,10 +24,8 @@ class IndexedPoints(NamedTuple):
     """Points in the order of their voxels, and these voxels at every scale."""
 
     points: Tensor  # (N, 4)
-    kept: Tensor  # (1,) int64, how many of them are inside, on the device
     voxel: Tensor  # (S, N) int64, the voxel of each point
     scales: dict[Grid, Scale]
-    means: dict[Grid, Tensor]  # (V, 4)
 
 
 def is_fused(encoder: HybridVoxelEncoder | PillarEncoder, batch_size: int) -> bool:
@@ -64,12 +61,9 @@ class FusedEncoder:
         """The voxels of points (N, 4) of samples (N,)."""
         grids = list(dict.fromkeys(self.encoder.feature_grids + self.encoder.projection_grids))
         index = nested_index(points, sample, grids)
-        parts, kept, rows = scales_of(index)
-        points = points[index.order[:rows]]
-        scales = dict(zip(grids, parts, strict=True))
-        return IndexedPoints(
-            points, kept, index.voxel, scales, {grid: voxel_means(points, at) for grid, at in scales.items()}
-        )
+        finest = min(range(len(grids)), key=lambda k: grids[k].cell)
+        scales, points = scales_of(index, points, finest)
+        return IndexedPoints(points, index.voxel, dict(zip(grids, scales, strict=True)))
 
     def point_features(self, indexed: IndexedPoints) -> tuple[Tensor, list[Tensor]]:
         """AVFE: M (N, T q) of the T feature scales side by side, and G' (V, q) of each."""
@@ -80,7 +74,7 @@ class FusedEncoder:
         grids = self.encoder.feature_grids
         product = features.new_empty(points.shape[0], len(grids) * features.shape[1])
         maxima = [
-            encode_voxels(features, points, indexed.means[grid], weight, indexed.scales[grid], avfe.relu, product, t)
+            encode_voxels(features, points, weight, indexed.scales[grid], avfe.relu, product, t)
             for t, grid in enumerate(grids)
         ]
         return product, maxima
@@ -94,16 +88,16 @@ class FusedEncoder:
         weight = folded(avfeo.features, avfeo.features_norm, None)
         halves = weight[:-1].chunk(2 * len(scales))
         context = torch.addmm(weight[-1], product, torch.cat(halves[0::2]))
-        of_voxels = context.new_empty(len(scales), max(scale.rows for scale in scales), context.shape[1])
+        of_voxels = context.new_empty(len(scales), max(len(scale.mean) for scale in scales), context.shape[1])
         for t, (values, half) in enumerate(zip(maxima, halves[1::2], strict=True)):
             torch.mm(values, half, out=of_voxels[t, : len(values)])
-        add_of_voxels(context, of_voxels, indexed.voxel[: len(scales)], indexed.kept)
+        add_of_voxels(context, of_voxels, indexed.voxel[: len(scales)], scales[0].kept)
         weight = folded(avfeo.knowledge, avfeo.knowledge_norm, None)
         images = []
         for grid in self.encoder.projection_grids:
             scale = indexed.scales[grid]
             image = self.image(grid, scale, batch_size, context.shape[1], dtype, points.device)
-            project_voxels(context, points, indexed.means[grid], weight, scale, avfeo.relu, image)
+            project_voxels(context, points, weight, scale, avfeo.relu, image)
             images.append(image.view(batch_size, *grid.shape, -1).permute(0, 3, 1, 2))
         return images
 
