@@ -175,7 +175,8 @@ def bench_first_step(bench: Bench, setting: Setting, inputs: Inputs, counts: Cou
 
     def fused_index() -> list[Tensor]:
         indexed = fused.index(points, sample)
-        return [indexed.points, indexed.kept, *indexed.voxel, *indexed.means.values()]
+        scales = [indexed.scales[grid] for grid in grids]
+        return [indexed.points, scales[0].kept, *indexed.voxel, *(scale.mean for scale in scales)]
 
     def pick_fused(found: list[Tensor]) -> list[Tensor]:
         kept = int(found[1])
@@ -306,7 +307,7 @@ def fused_stages(setting: Setting, points: Tensor, sample: Tensor) -> Stages:
     encoder = setting.fused()
     indexed = encoder.index(points, sample)
     feature_grids, projection_grids = setting.encoder.feature_grids, setting.encoder.projection_grids
-    voxels = {grid: int(scale.counts) for grid, scale in indexed.scales.items()}  # on a GPU arrays are longer
+    voxels = {grid: int(scale.voxels) for grid, scale in indexed.scales.items()}  # on a GPU arrays are longer
 
     def avfe() -> list[Tensor]:
         product, maxima = encoder.point_features(indexed)

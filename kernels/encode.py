@@ -6,7 +6,7 @@ of its voxel wherever they are needed, and so is the rest in the backward pass. 
 """
 
 # inside a kernel Warp's types are calls, and its tensors have no types that mypy knows
-# mypy: disable-error-code="valid-type,attr-defined,no-untyped-def,name-defined,misc,operator,index,arg-type"
+# mypy: disable-error-code="valid-type,attr-defined,no-untyped-def,name-defined,misc,operator,index,arg-type,type-var"
 
 import functools
 from types import SimpleNamespace
@@ -70,7 +70,7 @@ class Scale(NamedTuple):
     voxel: Tensor  # (N,) int64, the voxel of each point
     starts: Tensor  # int64, where each voxel's points start
     cursor: Tensor  # int64, cursor of each voxel
-    count: Tensor  # (1,) int64, number of voxels, on the device
+    voxels: Tensor  # (1,) int64, their number, on the device
     kept: Tensor  # (1,) int64, number of points, on the device
     mean: Tensor  # (rows, 4) float32, of each voxel's points
 
@@ -81,7 +81,10 @@ def scales_of(index: NestedIndex, points: Tensor, finest: int) -> tuple[list[Sca
     On a CPU the counts are at hand and bound the work; for many threads the number of points does, and nothing is read.
     """
     scales, capacity, device = len(index.counts) - 1, len(index.order), points.device
-    *rows, kept = [capacity] * (scales + 1) if many_threads(device) else index.counts.tolist()
+    rows = [capacity] * scales
+    kept = capacity
+    if not many_threads(device):
+        *rows, kept = index.counts.tolist()
     points = points[index.order[:kept]]
     counts = index.counts.split(1)
     means = voxel_means(points, index, finest, max(rows))
@@ -101,11 +104,11 @@ def voxel_means(points: Tensor, index: NestedIndex, finest: int, rows: int) -> T
     means = points.new_empty(scales, rows, 4)
     sums = points.new_empty(rows, 4, dtype=torch.float64)
     ends = points.new_empty(2, tasks, 4, dtype=torch.float64)
-    places = [array(index.starts), array(index.voxel), array(index.counts), finest]
-    inputs = [*places, size, array(ends, 4), array(sums, 4), array(means, 4)]
+    indexed = [array(index.starts), array(index.voxel), array(index.counts), finest]
+    inputs = [*indexed, size, array(ends, 4), array(sums, 4), array(means, 4)]
     launch(_sums, tasks, [array(points, 4), *inputs], points.device)
     launch(_sums_join, tasks, inputs, points.device)
-    launch(_means, (scales, rows), [*places, array(sums, 4), array(means, 4)], points.device)
+    launch(_means, (scales, rows), [*indexed, array(sums, 4), array(means, 4)], points.device)
     return means
 
 
@@ -175,7 +178,7 @@ def clear_voxels(image: Tensor, scale: Scale) -> None:
     count = image.shape[1]
     lanes = lanes_of(count, image.device)
     kernel = _clear_kernel(lanes, wp.dtype_from_torch(image.dtype))
-    inputs = [array(scale.cursor), array(scale.count), channels(image, lanes)]
+    inputs = [array(scale.cursor), array(scale.voxels), channels(image, lanes)]
     launch(kernel, (len(scale.mean), count // lanes), inputs, image.device)
 
 

@@ -139,7 +139,8 @@ def check_index(name: str, index: Tensor, size: int) -> None:
     """Checks that every value of an index tensor is in [0, size); reads the device once."""
     if index.numel() == 0:
         return
-    check_bounds(name, *torch.stack(torch.aminmax(index)).tolist(), size)
+    low, high = torch.stack(torch.aminmax(index)).tolist()
+    check_bounds(name, low, high, size)
 
 
 def check_bounds(name: str, low: int, high: int, size: int) -> None:

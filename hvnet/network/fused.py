@@ -1,6 +1,7 @@
 """The encoder in inference: the same two steps as in training, with kernels that keep nothing for gradients."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -35,18 +36,48 @@ def is_fused(encoder: HybridVoxelEncoder | PillarEncoder, batch_size: int) -> bo
     return is_nested(encoder.feature_grids + encoder.projection_grids, batch_size)
 
 
+@contextlib.contextmanager
+def products_in_tf32(device: torch.device) -> Iterator[None]:
+    """Inside, a GPU multiplies float32 matrices by its tensor cores, which round what they multiply to 11 bits.
+
+    docs/gpu.md has what that costs in AP.
+    """
+    precision = torch.backends.cuda.matmul.fp32_precision
+    if device.type == "cuda":
+        torch.backends.cuda.matmul.fp32_precision = "tf32"
+    try:
+        yield
+    finally:
+        if device.type == "cuda":
+            torch.backends.cuda.matmul.fp32_precision = precision
+
+
 class FusedEncoder:
     """Inference with the weights of an encoder: the same images, with batch norms folded and nothing kept for training.
 
     Nothing is read back from a GPU: arrays have the size of the points and counts stay on the device. The images are
-    reused: they hold until the next call, which clears them.
+    reused: they hold until the next call, which clears them. The weights are those that the encoder has when this is
+    made.
     """
 
+    @torch.no_grad()
     def __init__(self, encoder: HybridVoxelEncoder) -> None:
         """The encoder is one for which `is_fused` holds."""
-        assert isinstance(encoder.avfe, AttentiveVFE)
-        assert isinstance(encoder.avfeo, AttentiveVFE)
-        self.encoder, self.avfe, self.avfeo = encoder, encoder.avfe, encoder.avfeo
+        avfe, avfeo = encoder.avfe, encoder.avfeo
+        assert isinstance(avfe, AttentiveVFE)
+        assert isinstance(avfeo, AttentiveVFE)
+        self.feature_grids, self.projection_grids = encoder.feature_grids, encoder.projection_grids
+        self.grids = list(dict.fromkeys(self.feature_grids + self.projection_grids))
+        self.finest = min(range(len(self.grids)), key=lambda k: self.grids[k].cell)
+        self.relu = avfe.relu, avfeo.relu
+        features = folded(avfe.features, avfe.features_norm, None)
+        self.of_points, self.features_bias = features[:-1], features[-1]
+        self.knowledge = folded(avfe.knowledge, avfe.knowledge_norm, None)
+        # of H = [M, G'] of every feature scale: the halves in M as one matrix, those in G' scale by scale
+        context = folded(avfeo.features, avfeo.features_norm, None)
+        halves = context[:-1].chunk(2 * len(self.feature_grids))
+        self.of_product, self.of_maxima, self.context_bias = torch.cat(halves[0::2]), halves[1::2], context[-1]
+        self.image_knowledge = folded(avfeo.knowledge, avfeo.knowledge_norm, None)
         self.written: dict[tuple, tuple[Tensor, Scale]] = {}  # every image, and the voxels that were written last
 
     @torch.no_grad()
@@ -59,23 +90,18 @@ class FusedEncoder:
 
     def index(self, points: Tensor, sample: Tensor) -> IndexedPoints:
         """The voxels of points (N, 4) of samples (N,)."""
-        grids = list(dict.fromkeys(self.encoder.feature_grids + self.encoder.projection_grids))
-        index = nested_index(points, sample, grids)
-        finest = min(range(len(grids)), key=lambda k: grids[k].cell)
-        scales, points = scales_of(index, points, finest)
-        return IndexedPoints(points, index.voxel, dict(zip(grids, scales, strict=True)))
+        index = nested_index(points, sample, self.grids)
+        scales, points = scales_of(index, points, self.finest)
+        return IndexedPoints(points, index.voxel, dict(zip(self.grids, scales, strict=True)))
 
     def point_features(self, indexed: IndexedPoints) -> tuple[Tensor, list[Tensor]]:
         """AVFE: M (N, T q) of the T feature scales side by side, and G' (V, q) of each."""
-        avfe, points = self.avfe, indexed.points
-        weight = folded(avfe.features, avfe.features_norm, None)
-        features = torch.addmm(weight[-1], points, weight[:-1])
-        weight = folded(avfe.knowledge, avfe.knowledge_norm, None)
-        grids = self.encoder.feature_grids
-        product = features.new_empty(points.shape[0], len(grids) * features.shape[1])
+        # not in TF32, which would move a point at 60 m by 3 cm
+        features = torch.addmm(self.features_bias, indexed.points, self.of_points)
+        product = features.new_empty(len(features), len(self.feature_grids) * features.shape[1])
         maxima = [
-            encode_voxels(features, points, weight, indexed.scales[grid], avfe.relu, product, t)
-            for t, grid in enumerate(grids)
+            encode_voxels(features, indexed.points, self.knowledge, indexed.scales[grid], self.relu[0], product, t)
+            for t, grid in enumerate(self.feature_grids)
         ]
         return product, maxima
 
@@ -83,21 +109,19 @@ class FusedEncoder:
         self, product: Tensor, maxima: list[Tensor], indexed: IndexedPoints, batch_size: int, dtype: torch.dtype
     ) -> list[Tensor]:
         """AVFEO and Eq. 3: M and G' of the feature scales to the images (B, N_H, N_L, N_W), finest first."""
-        avfeo, points = self.avfeo, indexed.points
-        scales = [indexed.scales[grid] for grid in self.encoder.feature_grids]
-        weight = folded(avfeo.features, avfeo.features_norm, None)
-        halves = weight[:-1].chunk(2 * len(scales))
-        context = torch.addmm(weight[-1], product, torch.cat(halves[0::2]))
-        of_voxels = context.new_empty(len(scales), max(len(scale.mean) for scale in scales), context.shape[1])
-        for t, (values, half) in enumerate(zip(maxima, halves[1::2], strict=True)):
-            torch.mm(values, half, out=of_voxels[t, : len(values)])
+        points = indexed.points
+        scales = [indexed.scales[grid] for grid in self.feature_grids]
+        with products_in_tf32(points.device):
+            context = torch.addmm(self.context_bias, product, self.of_product)
+            of_voxels = context.new_empty(len(scales), max(len(scale.mean) for scale in scales), context.shape[1])
+            for t, (values, weight) in enumerate(zip(maxima, self.of_maxima, strict=True)):
+                torch.mm(values, weight, out=of_voxels[t, : len(values)])
         add_of_voxels(context, of_voxels, indexed.voxel[: len(scales)], scales[0].kept)
-        weight = folded(avfeo.knowledge, avfeo.knowledge_norm, None)
         images = []
-        for grid in self.encoder.projection_grids:
+        for grid in self.projection_grids:
             scale = indexed.scales[grid]
             image = self.image(grid, scale, batch_size, context.shape[1], dtype, points.device)
-            project_voxels(context, points, weight, scale, avfeo.relu, image)
+            project_voxels(context, points, self.image_knowledge, scale, self.relu[1], image)
             images.append(image.view(batch_size, *grid.shape, -1).permute(0, 3, 1, 2))
         return images
 
