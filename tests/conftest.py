@@ -28,17 +28,26 @@ def kitti_root() -> Path:
     return root
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
-def device(request: pytest.FixtureRequest) -> torch.device:
+@pytest.fixture(params=["cpu", "cpu-many-threads", pytest.param("cuda", marks=pytest.mark.cuda)])
+def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The ways that kernels and what calls them can go: a CPU's, a GPU's on the CPU, and a GPU's where there is one."""
     if request.param == "cuda" and not torch.cuda.is_available():
         pytest.skip("no CUDA device")
-    return torch.device(request.param)
+    monkeypatch.setattr(launch, "force_many_threads", request.param == "cpu-many-threads")
+    return request.param
 
 
-@pytest.fixture(params=["one thread", "many threads"])
-def threads(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs a test both ways: as a CPU works, and as a GPU does, on the CPU."""
-    monkeypatch.setattr(launch, "force_many_threads", request.param == "many threads")
+@pytest.fixture
+def device(way: str) -> torch.device:
+    """The device of a test that runs every way."""
+    return torch.device(way.partition("-")[0])
+
+
+@pytest.fixture
+def threads(way: str, request: pytest.FixtureRequest) -> None:
+    """Runs a test both ways of the CPU, and if it takes a device, every way."""
+    if way == "cuda" and "device" not in request.fixturenames:
+        pytest.skip("runs on the CPU")
 
 
 @pytest.fixture(scope="session")

@@ -71,6 +71,7 @@ def plain_encoder(
     return images
 
 
+@pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize(("feature_scales", "projection_scales"), SCALES)
 @pytest.mark.parametrize("training", [True, False])
 @pytest.mark.parametrize("relu", [True, False])
@@ -98,6 +99,7 @@ def test_encoder_is_the_papers(
         torch.testing.assert_close(a, b, rtol=1e-3, atol=2e-3 * float(b.abs().max()) + 1e-6)
 
 
+@pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("training", [True, False])
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_few_points(count: int, training: bool) -> None:
@@ -120,6 +122,7 @@ def test_a_million_points_in_one_voxel() -> None:
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.usefixtures("threads")
 def test_samples_do_not_mix() -> None:
     encoder = HybridVoxelEncoder(SMALL).eval()
     points, sample = cloud(300, samples=3)
@@ -132,6 +135,7 @@ def test_samples_do_not_mix() -> None:
                 torch.testing.assert_close(a[0], t[b], rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.usefixtures("threads")
 def test_order_of_points_does_not_matter() -> None:
     encoder = HybridVoxelEncoder(SMALL).eval()
     points, sample = cloud(300)
@@ -141,6 +145,7 @@ def test_order_of_points_does_not_matter() -> None:
             torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.usefixtures("threads")
 def test_same_bits_twice() -> None:
     points, sample = cloud(500)
     results = []
@@ -228,6 +233,7 @@ def test_memory_goes_by_points_not_by_cells() -> None:
     assert training < 900
 
 
+@pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("training", [True, False])
 @pytest.mark.parametrize(("feature_scales", "projection_scales"), SCALES[:3])
 def test_without_attention(
@@ -254,6 +260,7 @@ def test_without_attention(
             assert torch.equal(own, other)
 
 
+@pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("vfe", ["attentive", "plain"])
 def test_hard_voxels_drop_points_before_the_encoder(vfe: str) -> None:
     """At most 2 points of a voxel of 0.4 m, and 40 voxels a sample: the encoder sees the others only."""

@@ -13,6 +13,7 @@ from hvnet.network.fused import FusedEncoder, inference, is_fused
 from hvnet.network.model import make_encoder
 from tests.encoders import SCALES, SMALL, cloud, trained
 
+pytestmark = pytest.mark.usefixtures("threads")
 PILLARS = {"vfe": "pillar", "feature_scales": (1.0,), "projection_scales": (1.0,), "point_limit": 4, "voxel_limit": 9}
 
 
