@@ -84,9 +84,9 @@ class Code(NamedTuple):
     loops: bool  # False: there is no loop, and loads and stores are those of the whole kernel
 
 
-def short_name(kernel: wp.Kernel) -> str:
-    """The name of the function that a kernel was made of."""
-    return kernel.func.__name__
+def name_of(kernel: wp.Kernel) -> str:
+    """module.function of a kernel."""
+    return f"{kernel.func.__module__.removeprefix('hvnet.kernels.')}.{kernel.func.__name__}"
 
 
 def find_kernels() -> list[Found]:
@@ -102,8 +102,7 @@ def find_kernels() -> list[Found]:
             if getattr(value, "__module__", None) not in (module.__name__, None):
                 continue  # imported from another module, which is looked through as well
             for kernel, parameters in made_kernels(value):
-                name = f"{kernel.func.__module__.removeprefix('hvnet.kernels.')}.{short_name(kernel)}"
-                found.setdefault(id(kernel), Found(name, kernel, parameters))
+                found.setdefault(id(kernel), Found(name_of(kernel), kernel, parameters))
     return list(found.values())
 
 
