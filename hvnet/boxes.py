@@ -24,8 +24,9 @@ def limit_angle(angle: Tensor) -> Tensor:
 
 def bev_corners(boxes: Tensor) -> Tensor:
     """Corners of boxes (..., 7) in bird's eye view: (..., 4, 2), front-left, front-right, rear-right, rear-left."""
-    along = boxes.new_tensor([0.5, 0.5, -0.5, -0.5]) * boxes[..., 3:4]
-    across = boxes.new_tensor([0.5, -0.5, -0.5, 0.5]) * boxes[..., 4:5]
+    corner = torch.arange(4, device=boxes.device)  # the signs are worked out: constants would be copied to a GPU
+    along = (0.5 - corner // 2).to(boxes.dtype) * boxes[..., 3:4]  # 0.5, 0.5, -0.5, -0.5
+    across = (0.5 - (corner + 1) // 2 % 2).to(boxes.dtype) * boxes[..., 4:5]  # 0.5, -0.5, -0.5, 0.5
     cos, sin = boxes[..., 6:7].cos(), boxes[..., 6:7].sin()
     x = boxes[..., 0:1] + along * cos - across * sin
     y = boxes[..., 1:2] + along * sin + across * cos
