@@ -1,13 +1,16 @@
 """Anchors of a class, the boxes encoded against them (Sec. 3.5), and their matching."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from hvnet.boxes import bev_corners, limit_angle
 from hvnet.config import ClassConfig, Config
+from hvnet.kernels.launch import many_threads
 from hvnet.kernels.rotated import rotated_match
 from hvnet.network.grids import projection_grids, pyramid_depth
 
@@ -27,10 +30,16 @@ MAX_OUTPUT = 50.0
 
 
 class Targets(NamedTuple):
-    """Targets of the anchors of one class over a batch; P of them are positive, in the order of nonzero()."""
+    """Targets of the anchors of one class over a batch, and P rows for the positive ones, in the order of nonzero().
+
+    One thread has as many rows as positive anchors. Many threads read no number from the device: they have as many rows
+    as there can be, and those that are not used are anchors matched to themselves, whose targets are 0.
+    """
 
     positive: Tensor  # (B, A) bool
     negative: Tensor  # (B, A) bool; anchors that are neither are ignored
+    rows: Tensor  # (P,) int64, indices into the B * A anchors
+    used: Tensor  # (P,) bool
     location: Tensor  # (P, 8) metres, or (P, 5)
     vertical: Tensor  # (P, 2)
     direction: Tensor  # (P,) int64
@@ -49,10 +58,15 @@ def level_step(config: Config, entry: ClassConfig) -> int:
     return config.backbone.stride * 2 ** (pyramid_depth(config.encoder) - 3 + entry.level)
 
 
+def cell_size(config: Config, entry: ClassConfig) -> tuple[float, float]:
+    """Metres along x and y between the anchors of a class."""
+    grid, step = projection_grids(config.encoder)[0], level_step(config, entry)
+    return grid.cell[0] * step, grid.cell[1] * step
+
+
 def make_anchors(config: Config, entry: ClassConfig) -> Tensor:
     """Anchors (A, 7) of a class at the centres of its level's cells, in the order (x, y, size, orientation)."""
-    grid, step = projection_grids(config.encoder)[0], level_step(config, entry)
-    cell = (grid.cell[0] * step, grid.cell[1] * step)
+    grid, step, cell = projection_grids(config.encoder)[0], level_step(config, entry), cell_size(config, entry)
     x = grid.x_min + (torch.arange(grid.shape[0] // step, dtype=torch.float64) + 0.5) * cell[0]
     y = grid.y_min + (torch.arange(grid.shape[1] // step, dtype=torch.float64) + 0.5) * cell[1]
     sizes = torch.tensor(entry.anchor_sizes, dtype=torch.float64)
@@ -123,25 +137,78 @@ def decode(location: Tensor, vertical: Tensor, direction: Tensor | None, anchors
     return torch.cat((centre, z, *sizes, limit_angle(yaw)), dim=1)
 
 
+def positives_per_box(config: Config, entry: ClassConfig) -> int:
+    """The most anchors of a class that one box, of whatever size, makes positive.
+
+    Let r be half the anchor's diagonal and d > r the distance of the centres. Along the line through both, the box's
+    area falls off from its centre to either side alike: at most r / (d + r) of it is within the anchor's reach. An IoU
+    above t needs more than t of it, hence d < r (1 / t - 1).
+    """
+    count = 1  # the best anchor, whatever its IoU
+    for length, width, _ in entry.anchor_sizes:
+        reach = 1.001 * math.hypot(length, width) / 2 * max(1.0, 1 / entry.positive_iou - 1)  # more than any rounding
+        cells = (math.floor(2 * reach / cell) + 1 for cell in cell_size(config, entry))
+        count += len(ORIENTATIONS) * math.prod(cells)
+    return count
+
+
+def boxes_of_class(boxes: Sequence[Tensor], labels: Sequence[Tensor], label: int) -> list[Tensor]:
+    """The boxes (M_b, 7) of every sample that have the label.
+
+    Many threads, which read no number from the device, leave rows of NaN for the others: they match nothing.
+    """
+    if many_threads(boxes[0].device):
+        others = torch.cat(list(labels)) != label
+        sizes = [len(own) for own in boxes]
+        return list(torch.cat(list(boxes)).masked_fill(others[:, None], math.nan).split(sizes))
+    return [own[of_own == label] for own, of_own in zip(boxes, labels, strict=True)]
+
+
 def assign_targets(
-    anchors: Tensor, boxes: list[Tensor], positive_iou: float, negative_iou: float, regression: str = "corners"
+    anchors: Tensor,
+    boxes: Sequence[Tensor],
+    positive_iou: float,
+    negative_iou: float,
+    regression: str = "corners",
+    per_box: int | None = None,
 ) -> Targets:
     """Matches anchors (A, 7) of a class to its boxes, one (M_b, 7) a sample, by rotated IoU in bird's eye view.
 
     Positive: IoU above positive_iou, or the best anchor of a box (if it overlaps at all; of two boxes with one best
-    anchor the first has it). Negative: IoU below negative_iou.
+    anchor the first has it). Negative: IoU below negative_iou. per_box is what `positives_per_box` gives; without it
+    many threads have a row for every anchor.
     """
-    starts = torch.tensor([0, *(len(b) for b in boxes)], device=anchors.device).cumsum(0)
-    every = torch.cat(boxes)
-    iou, match, best = rotated_match(anchors, every, starts)
-    sample = torch.repeat_interleave(torch.arange(len(boxes), device=anchors.device), starts.diff())
-    overlapping = (best >= 0).nonzero().squeeze(1)
-    forced = torch.full((iou.numel(),), len(every), dtype=torch.int64, device=anchors.device)
-    forced.scatter_reduce_(0, (sample * len(anchors) + best)[overlapping], overlapping, "amin")
-    forced = forced.view_as(match)
-    is_forced = forced < len(every)
+    device = anchors.device
+    every = pad_sequence(list(boxes), batch_first=True, padding_value=math.nan)  # (B, M, 7)
+    samples = torch.arange(len(every) + 1, device=device)
+    count = every.shape[0] * every.shape[1]
+    iou, match, best = rotated_match(anchors, every.view(-1, 7), samples * every.shape[1])
+    # the first box of those whose best anchor it is; `count` is none
+    nearest = samples[:-1, None] * len(anchors) + best.view(every.shape[:2]).clamp(min=0)
+    of_box = torch.arange(count, device=device).masked_fill(best < 0, count)
+    forced = torch.full((iou.numel(),), count, dtype=torch.int64, device=device)
+    forced = forced.scatter_reduce_(0, nearest.flatten(), of_box, "amin").view_as(match)
+    is_forced = forced < count
     match = torch.where(is_forced, forced, match)
     positive = (iou > positive_iou) | is_forced
-    of_positive, matched = anchors[positive.nonzero()[:, 1]], every[match[positive]]
     negative = (iou < negative_iou) & ~positive
-    return Targets(positive, negative, *encode(matched, of_positive, regression), of_positive, matched)
+    most = positive.numel() if per_box is None else sum(map(len, boxes)) * per_box
+    rows, used = true_rows(positive, most)
+    of_positive = anchors[rows % len(anchors)]
+    matched = every.view(-1, 7)[match.flatten()[rows].clamp(min=0)] if count else of_positive
+    matched = torch.where(used[:, None], matched, of_positive)
+    return Targets(positive, negative, rows, used, *encode(matched, of_positive, regression), of_positive, matched)
+
+
+def true_rows(mask: Tensor, most: int) -> tuple[Tensor, Tensor]:
+    """The indices (P,) int64 into the flat mask where it is true, and which of them are used (P,) bool.
+
+    Many threads, which read no number from the device, have min(most, size of the mask) of them, more than there are
+    true ones; those that are not used are all different.
+    """
+    mask = mask.flatten()
+    if not many_threads(mask.device):
+        rows = mask.nonzero().squeeze(1)
+        return rows, torch.ones_like(rows, dtype=torch.bool)
+    rows = mask.nonzero_static(size=min(most, len(mask))).squeeze(1)
+    return torch.where(rows < 0, torch.arange(len(rows), device=mask.device), rows), rows >= 0

@@ -12,6 +12,8 @@ from hvnet.network.anchors import Targets, decode
 from hvnet.network.head import HeadMaps
 from hvnet.ranks import all_reduce
 
+IGNORED = -100  # the direction of a row that is not used
+
 
 def focal_loss(logits: Tensor, positive: Tensor, negative: Tensor, alpha: float, gamma: float) -> Tensor:
     """Sum over the anchors (B, A) of -alpha (1 - p)^gamma log p; negatives have 1 - alpha and 1 - p in place."""
@@ -24,28 +26,35 @@ def class_loss(maps: HeadMaps, targets: Targets, entry: ClassConfig, weights: Lo
     """The weighted terms of one class, each divided by max(1, positives of the class in the batch of all ranks)."""
     positives = all_reduce(targets.positive.sum()).clamp(min=1)
     focal = focal_loss(maps.logits, targets.positive, targets.negative, entry.focal_alpha, entry.focal_gamma)
-    at = targets.positive
     smooth_l1 = functools.partial(F.smooth_l1_loss, reduction="sum", beta=weights.beta)
-    location, vertical = maps.location[at], maps.vertical[at]
+    location, vertical = rows_of(maps.location, targets), rows_of(maps.vertical, targets)
     if weights.box == "smooth_l1":
         box = smooth_l1(location, targets.location)
     else:
         overlap = iou_pairs(targets.boxes, decode(location, vertical, None, targets.anchors), weights.box == "giou")
-        box = (1 - overlap).sum()
+        box = ((1 - overlap) * targets.used).sum()
     terms = {
         "classification": weights.classification * focal,
         "localization": weights.localization * box,
         "vertical": weights.vertical * smooth_l1(vertical, targets.vertical),
     }
     if maps.direction is not None:
-        direction = F.cross_entropy(maps.direction[at], targets.direction, reduction="sum")
+        bins = targets.direction.masked_fill(~targets.used, IGNORED)
+        direction = F.cross_entropy(rows_of(maps.direction, targets), bins, reduction="sum", ignore_index=IGNORED)
         terms["direction"] = weights.direction * direction
     if maps.iou is not None:
         with torch.no_grad():
             overlap = iou_pairs(targets.boxes, decode(location, vertical, None, targets.anchors))
-        iou = F.binary_cross_entropy_with_logits(maps.iou[at], overlap, reduction="sum")
+        used = targets.used.to(overlap.dtype)
+        iou = F.binary_cross_entropy_with_logits(rows_of(maps.iou, targets), overlap, used, reduction="sum")
         terms["iou"] = weights.iou * iou
     return {name: term / positives for name, term in terms.items()}
+
+
+def rows_of(values: Tensor, targets: Targets) -> Tensor:
+    """The rows (P, ...) of a map (B, A, ...); those not used are 0, as their targets are, and pass no gradient on."""
+    rows = values.flatten(0, 1)[targets.rows]
+    return rows.masked_fill(~targets.used.view(-1, *(1,) * (rows.ndim - 1)), 0.0)
 
 
 def iou_pairs(a: Tensor, b: Tensor, generalized: bool = False) -> Tensor:

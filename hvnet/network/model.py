@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from hvnet.config import Config, EncoderConfig
 from hvnet.kernels.rotated import rotated_nms
-from hvnet.network.anchors import assign_targets, decode, make_anchors
+from hvnet.network.anchors import assign_targets, boxes_of_class, decode, make_anchors, positives_per_box
 from hvnet.network.backbone import Backbone
 from hvnet.network.encoder import HybridVoxelEncoder
 from hvnet.network.grids import projection_grids
@@ -84,9 +84,9 @@ class HVNet(nn.Module):
         """
         total: dict[str, Tensor] = {}
         for k, entry in enumerate(self.config.head.classes):
-            own = [b[at == k] for b, at in zip(boxes, labels, strict=True)]
-            thresholds = entry.positive_iou, entry.negative_iou
-            targets = assign_targets(self.anchors(k), own, *thresholds, self.config.head.regression)
+            own = boxes_of_class(boxes, labels, k)
+            thresholds, most = (entry.positive_iou, entry.negative_iou), positives_per_box(self.config, entry)
+            targets = assign_targets(self.anchors(k), own, *thresholds, self.config.head.regression, most)
             for name, term in class_loss(maps[k], targets, entry, self.config.loss).items():
                 total[name] = total[name] + term if name in total else term
         for name, s in self.log_variances.items():
