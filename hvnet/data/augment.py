@@ -15,6 +15,7 @@ from torch import Generator, Tensor
 from hvnet.boxes import boxes_collide, limit_angle, points_in_boxes
 from hvnet.config import AugmentConfig
 from hvnet.data.gt_database import Database, object_points
+from hvnet.kernels.launch import many_threads
 
 MIN_POINTS = 5
 """Objects of fewer points are not inserted, as in SECOND."""
@@ -42,6 +43,21 @@ def sampler_of(database: Database, device: torch.device) -> ObjectSampler:
     return ObjectSampler(database, object_points(database).to(device), of_class, of_frame)
 
 
+def send(tensor: Tensor, device: torch.device) -> Tensor:
+    """A tensor of the host on a device. For a GPU it is copied from pinned memory, so that the host does not wait."""
+    return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor.to(device)
+
+
+def drop(points: Tensor, gone: Tensor) -> Tensor:
+    """The points (N, 4) without those of a mask (N,).
+
+    Many threads, which read no number from the device, leave rows of NaN for them: such points are in no voxel.
+    """
+    if many_threads(points.device):
+        return points.masked_fill(gone[:, None], math.nan)
+    return points[~gone]
+
+
 def augment(
     points: Tensor,
     boxes: Tensor,
@@ -53,7 +69,8 @@ def augment(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Augments one frame: points (N, 4), boxes (M, 7) and labels (M,), which number the boxes' classes in `classes`.
 
-    The points may be on a GPU; boxes and labels stay on the host, because the random choices depend on them.
+    The points may be on a GPU, from which nothing is read; boxes and labels stay on the host, because the random
+    choices depend on them.
 
     Objects are inserted first, as in SECOND, which the paper follows, though it names the global changes first: objects
     keep the pose in which the scanner saw them, which is in the camera's view only before the frame is turned.
@@ -111,7 +128,7 @@ def random_translation(
     """Moves everything by a normal sample with mean 0 and the given standard deviations along x, y and z, metres."""
     shift = torch.randn(3, generator=generator) * torch.tensor(deviation)
     points, boxes = points.clone(), boxes.clone()
-    points[:, :3] += shift.to(points.device)
+    points[:, :3] += send(shift, points.device)
     boxes[:, :3] += shift
     return points, boxes
 
@@ -136,7 +153,7 @@ def mix_sectors(
     new, new_labels = others[1][other_boxes], others[2][other_boxes]
 
     def within(cloud: Tensor, among: Tensor) -> Tensor:
-        return points_in_boxes(cloud, among.to(cloud.device)).any(dim=1)
+        return points_in_boxes(cloud, send(among, cloud.device)).any(dim=1)
 
     in_own, in_new = within(points, own), within(points, new)
     from_own, from_new = within(others[0], own), within(others[0], new)
@@ -145,7 +162,8 @@ def mix_sectors(
     # half of an object that is removed with the other side must not stay behind
     stays &= ~within(points, boxes[~kept_boxes]) | in_own
     comes &= ~within(others[0], others[1][~other_boxes]) | from_new
-    return torch.cat((points[stays], others[0][comes])), torch.cat((own, new)), torch.cat((own_labels, new_labels))
+    cloud = torch.cat((drop(points, ~stays), drop(others[0], ~comes)))
+    return cloud, torch.cat((own, new)), torch.cat((own_labels, new_labels))
 
 
 def sample_objects(
@@ -208,7 +226,7 @@ def _insert(
     if len(inserted) == 0:
         return points, boxes, labels
     new_boxes = drawn_boxes[inserted]
-    points = points[~points_in_boxes(points, new_boxes.to(points.device)).any(dim=1)]
+    points = drop(points, points_in_boxes(points, send(new_boxes, points.device)).any(dim=1))
     offsets = objects.database.offsets
     points = torch.cat([points, *(objects.points[offsets[k] : offsets[k + 1]] for k in drawn[inserted])])
     return points, torch.cat((boxes, new_boxes)), torch.cat((labels, labels.new_tensor(drawn_labels)[inserted]))

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from hvnet import ranks
 from hvnet.config import Config
-from hvnet.data.augment import ObjectSampler, augment, mix_sectors
+from hvnet.data.augment import ObjectSampler, augment, mix_sectors, send
 from hvnet.data.frame import Frame, Frames, check_names, frame_at, object_names
 from hvnet.data.gt_database import Database, build_database, load_database
 from hvnet.data.kitti import KittiFrames, read_split_frames
@@ -82,8 +82,9 @@ class Batch(NamedTuple):
     names: list[str]  # of the frames
 
     def to(self, device: torch.device) -> "Batch":
-        """The batch on a device."""
-        boxes, labels = [b.to(device) for b in self.boxes], [each.to(device) for each in self.labels]
+        """The batch on a device. A GPU's points are there already, and for the rest the host does not wait."""
+        sizes = [len(each) for each in self.boxes]  # one copy for all samples
+        boxes, labels = (list(send(torch.cat(part), device).split(sizes)) for part in (self.boxes, self.labels))
         return self._replace(points=self.points.to(device), sample=self.sample.to(device), boxes=boxes, labels=labels)
 
 
@@ -200,7 +201,7 @@ def collate(samples: Sequence[Sample | InputError]) -> Batch | InputError:
             return each
         good.append(each)
     points, boxes, labels, notes, names = zip(*good, strict=True)
-    sample = torch.repeat_interleave(torch.arange(len(points)), torch.tensor([len(p) for p in points]))
+    sample = torch.cat([torch.full((len(cloud),), k, device=cloud.device) for k, cloud in enumerate(points)])
     return Batch(torch.cat(points), sample, list(boxes), list(labels), list(notes), list(names))
 
 
