@@ -88,11 +88,13 @@ def time_steps(run: Run, repeat: int) -> dict[str, list[float]]:
             clock.on = True
             clock.begin()
             run.step(next(stream))
+            run.read_steps()
             clock.end("optimiser")
             clock.on = False
             synchronise(run.device)
             begin = time.perf_counter()
             run.step(next(stream))
+            run.read_steps()
             synchronise(run.device)
             if turn >= WARM_UP:
                 times["step"].append(time.perf_counter() - begin)

@@ -142,6 +142,7 @@ class TrainConfig:
     repeat: int = 1  # passes over the frames in an epoch, augmented differently each time
     gradient_clip: float = 10.0  # largest norm of the gradient
     validate_every: int = 10  # epochs; the last epoch is always validated
+    report_every: int = 1  # steps; between reports a GPU is not waited for
     pictures: int = 4  # validation frames drawn
     workers: int = 0  # processes that read and augment
     bfloat16: bool = False  # backbone and heads in bfloat16; the encoder stays in float32
@@ -377,7 +378,7 @@ CHECKS = (
     Check("augment", "translation", "0 or more", lambda v: min(v) >= 0),
     Check("data", "columns", COLUMNS, lambda v: not v or are_columns(v)),
     Check("data", "reflectance_scale", "above 0, or 0 for none", lambda v: v is None or v >= 0),
-    Check("train", "epochs repeat batch_size validate_every", "1 or more", lambda v: v > 0),
+    Check("train", "epochs repeat batch_size validate_every report_every", "1 or more", lambda v: v > 0),
     Check("train", "warmup_steps pictures workers weight_decay seed", "0 or more", lambda v: v >= 0),
     Check("train", "learning_rate warmup_ratio decay_ratio gradient_clip", "above 0", lambda v: v > 0),
     Check("train", "seed", "below 2**63", lambda v: v < 2**63),

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 from torch.utils.data import DataLoader
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -30,6 +31,7 @@ from hvnet.data.stamps import Change, Stamps, describe_changes, find_changes, ta
 from hvnet.evaluation.scoring import Detected, background_note, print_once, score
 from hvnet.evaluation.tables import format_table
 from hvnet.exceptions import InputError, Stopped
+from hvnet.kernels.launch import many_threads
 from hvnet.network.checkpoint import load_checkpoint, save_checkpoint
 from hvnet.network.detector import Detector
 from hvnet.network.model import HVNet
@@ -50,7 +52,16 @@ SAVE_SECONDS = 300.0
 
 CHANGEABLE = [
     f"train.{key}"
-    for key in ("epochs", "learning_rate", "validate_every", "pictures", "workers", "skip_corrupt", "skip_non_finite")
+    for key in (
+        "epochs",
+        "learning_rate",
+        "validate_every",
+        "report_every",
+        "pictures",
+        "workers",
+        "skip_corrupt",
+        "skip_non_finite",
+    )
 ]
 """Keys that may differ from the run being resumed; epochs only if the learning rate does not depend on them."""
 
@@ -62,6 +73,15 @@ class Progress(NamedTuple):
     batch: int = 0  # batches done of the next one
     step: int = 0
     sums: dict[str, float] | None = None
+
+
+class Step(NamedTuple):
+    """A step whose losses have not been read from the device."""
+
+    step: int
+    names: list[str]  # of its frames
+    terms: tuple[str, ...]
+    numbers: Tensor  # the losses: their sum and the terms; the signals that have come; the norm of the gradient
 
 
 class Run:
@@ -82,6 +102,7 @@ class Run:
         self.resumed = resume
         self.board: SummaryWriter | None = None  # open in `train`
         self.signals: list[int] = []
+        self.unread: list[Step] = []
         self.seen: set[str] = set()  # notes that were printed
         self.stamps: dict[str, Stamps] = {}  # of the training and validation frames, where their formats have some
         if ranks.rank() == 0 and not resume and self.checkpoint.exists():
@@ -97,7 +118,10 @@ class Run:
             self.model = HVNet(config).to(device)
             self.joint = ranks.wrap_ddp(self.model)  # the model, with its gradients averaged over the ranks
             self.optimizer = torch.optim.Adam(
-                self.model.parameters(), lr=config.train.learning_rate, weight_decay=config.train.weight_decay
+                self.model.parameters(),
+                lr=config.train.learning_rate,
+                weight_decay=config.train.weight_decay,
+                fused=many_threads(device) or None,
             )
             self.progress = self.restore() if resume else Progress()
         self.stamp_frames()
@@ -170,10 +194,10 @@ class Run:
         if changes:
             self.say(f"{self.checkpoint}: since it was written, {describe_changes(changes)}; they are used as they are")
 
-    def step(self, batch: Batch) -> dict[str, float]:
-        """One step of the optimizer: the losses of the batch, summed over the ranks, and `stop`, if a signal has come.
+    def step(self, batch: Batch) -> None:
+        """One step of the optimizer. Its losses are kept for `read_steps`: a GPU is not waited for.
 
-        A loss or gradient that is not finite changes nothing, and ends the run or is noted.
+        A loss or gradient that is not finite changes nothing.
         """
         config, model, progress = self.config.train, self.model, self.progress
         for group in self.optimizer.param_groups:
@@ -188,15 +212,33 @@ class Run:
         (ranks.size() * loss).backward()  # the ranks' gradients are averaged, the loss is their sum
         norm = torch.nn.utils.clip_grad_norm_(model.parameters(), config.gradient_clip)
         parts = torch.stack([loss, *terms.values(), torch.full_like(loss, len(self.signals))]).detach()
-        losses = dict(zip(("loss", *terms, "stop"), ranks.all_reduce(parts).tolist(), strict=True))
-        if math.isfinite(losses["loss"] + norm.item()):
+        numbers = torch.cat((ranks.all_reduce(parts), norm[None]))
+        finite = numbers[0].isfinite() & norm.isfinite()
+        if many_threads(self.device):  # the device decides
+            self.optimizer.found_inf = (~finite).float()  # type: ignore[attr-defined]  # read by the fused step
             self.optimizer.step()
-            losses["batches"] = 1.0
-        else:
-            self.note_non_finite(losses["loss"], norm.item(), batch.names)
-            for name, buffer in model.named_buffers():  # the batch norms have seen what is not finite
-                buffer.copy_(statistics[name])
-        return losses
+        elif finite:
+            self.optimizer.step()
+        for name, statistic in statistics.items():  # the batch norms have seen what is not finite
+            buffer = model.get_buffer(name)
+            buffer.copy_(torch.where(finite, buffer, statistic))
+        self.unread.append(Step(progress.step, batch.names, tuple(terms), numbers))
+
+    def read_steps(self) -> list[dict[str, float]]:
+        """The losses of the steps since the last call, summed over the ranks, by one read of the device.
+
+        `stop` is not 0 if a signal has come, `batches` 1. A step that is not finite has no `batches`: it is noted, or
+        ends the run.
+        """
+        steps, self.unread = self.unread, []
+        read = []
+        for each, (*losses, norm) in zip(steps, torch.stack([each.numbers for each in steps]).tolist(), strict=True):
+            read.append(dict(zip(("loss", *each.terms, "stop"), losses, strict=True)))
+            if math.isfinite(losses[0]) and math.isfinite(norm):
+                read[-1]["batches"] = 1.0
+            else:
+                self.note_non_finite(each, losses[0], norm)
+        return read
 
     def epoch(self) -> dict[str, Any]:
         """The rest of the epoch that is under way, its validation if one is due, and its record, which is kept.
@@ -228,6 +270,7 @@ class Run:
         assert isinstance(order, EpochOrder)
         order.epoch, order.begin = epoch, batches
         saved = time.monotonic()
+        self.unread.clear()
         self.model.train()
         bar = tqdm(
             self.loader,
@@ -243,13 +286,17 @@ class Run:
             for batch in bar:
                 if isinstance(batch, InputError):
                     raise batch
-                losses = self.step(batch)
-                stop = losses.pop("stop")
-                if "batches" in losses:
-                    for name, value in losses.items():
-                        sums[name] = sums.get(name, 0.0) + value
+                self.step(batch)
                 step, batches = step + 1, batches + 1
                 self.progress = Progress(epoch, batches, step, sums)
+                if len(self.unread) < self.config.train.report_every and batches < len(self.loader):
+                    continue
+                stop = 0.0
+                for losses in self.read_steps():
+                    stop += losses.pop("stop")
+                    if "batches" in losses:
+                        for name, value in losses.items():
+                            sums[name] = sums.get(name, 0.0) + value
                 rate = self.config.train.batch_size * (bar.format_dict["rate"] or 0)
                 bar.set_postfix(loss=f"{losses['loss']:.3f}", frames=f"{rate:.1f}/s")
                 if stop:
@@ -280,7 +327,8 @@ class Run:
     def train(self) -> None:
         """Runs the remaining epochs; writes checkpoint.pt, metrics.jsonl, tensorboard/ and pictures/.
 
-        SIGTERM or SIGINT ends it after the step that is under way, saved, by raising Stopped.
+        SIGTERM or SIGINT ends it at the next report, after the step that is under way if there is one a step: the run
+        is saved, and Stopped raised.
         """
         self.signals.clear()  # of an earlier call
         with caught_signals(self.signals), self.open_board():
@@ -325,10 +373,10 @@ class Run:
         with (self.out / "metrics.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(record) + "\n")
 
-    def note_non_finite(self, loss: float, norm: float, names: list[str]) -> None:
+    def note_non_finite(self, of_step: Step, loss: float, norm: float) -> None:
         """Keeps the frames of a step whose loss or gradient is not finite in non_finite.jsonl; ends the run or not."""
-        names = [name for share in ranks.all_gather(names) for name in share]
-        path, epoch, step = self.out / "non_finite.jsonl", self.progress.epoch, self.progress.step
+        names = [name for share in ranks.all_gather(of_step.names) for name in share]
+        path, epoch, step = self.out / "non_finite.jsonl", self.progress.epoch, of_step.step
         if ranks.rank() == 0:
             with path.open("a", encoding="utf-8") as file:
                 line = {"epoch": epoch + 1, "step": step, "loss": str(loss), "gradient": str(norm), "frames": names}
@@ -372,6 +420,8 @@ class Run:
         path, content = self.checkpoint, load_checkpoint(self.checkpoint)
         try:
             self.model.load_state_dict(content["model"])
+            for group in content["optimizer"]["param_groups"]:  # a run may go on on another device
+                group["fused"] = self.optimizer.defaults["fused"]
             self.optimizer.load_state_dict(content["optimizer"])
             torch.set_rng_state(content["random"])
             for split, numbers in content.get("stamps", {}).items():  # earlier versions keep none

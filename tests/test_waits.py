@@ -1,0 +1,93 @@
+"""Training does not wait for a GPU: what would read it is counted, on the CPU, which works as a GPU does."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from unittest import mock
+
+import pytest
+import torch
+from torch import Tensor
+from torch.profiler import ProfilerActivity, profile
+
+from hvnet.config import Config
+from hvnet.data.augment import sampler_of
+from hvnet.data.gt_database import load_database
+from hvnet.data.kitti import KittiFrames
+from hvnet.kernels import launch
+from hvnet.training.batches import Batch, TrainingFrames, collate, kitti_data
+from hvnet.training.run import Run
+
+READS = {f"aten::{name}" for name in ("_local_scalar_dense", "nonzero", "masked_select", "equal", "bincount")}
+READS |= {f"aten::{name}" for name in ("_unique2", "unique_dim", "unique_consecutive", "repeat_interleave")}
+COPIES = {"aten::lift_fresh"}  # of torch.tensor and new_tensor: numbers of the host
+
+
+@pytest.fixture(autouse=True)
+def many_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launch, "force_many_threads", True)
+
+
+def waits(work: Callable[[], object]) -> list[str]:
+    """The operations of `work`, those inside of ops included, for which the host would wait."""
+    found, plain = [], Tensor.tolist
+
+    def tolist(tensor: Tensor) -> list:
+        found.append("tolist")  # on the CPU it is no operation of torch's
+        return plain(tensor)
+
+    with mock.patch.object(Tensor, "tolist", tolist), profile(activities=[ProfilerActivity.CPU]) as recorded:
+        work()
+    events = recorded.events()
+    assert events is not None
+    for event in events:
+        parent = event.cpu_parent and event.cpu_parent.cpu_parent
+        if event.name in READS | COPIES and (parent is None or parent.name != "aten::_fused_adam_"):
+            found.append(event.name)  # the fused step of a CPU, not that of a GPU, reads the numbers of its steps
+    return found
+
+
+def test_what_waits_is_counted() -> None:
+    values = torch.arange(3)
+    assert waits(lambda: values[values > 1]) == ["aten::nonzero"]
+    assert waits(lambda: values.sum().item()) == ["aten::_local_scalar_dense"]
+    assert waits(lambda: bool(values.any())) == ["aten::_local_scalar_dense"]
+    assert waits(lambda: values.tolist()) == ["tolist"]
+    assert waits(lambda: values.new_tensor([1, 2])) == ["aten::lift_fresh"]
+    assert waits(lambda: torch.where(values > 1, values, 0).cumsum(0)) == []
+
+
+@pytest.mark.parametrize("changed", ["nothing", "loss.box", "skip_non_finite"])
+def test_a_step_waits_for_the_encoder_alone(scenes: Path, tiny: Config, tmp_path: Path, changed: str) -> None:
+    """... and reading the losses is one wait, for however many steps."""
+    config = tiny
+    if changed == "loss.box":
+        head, loss = dataclasses.replace(tiny.head, iou=True), dataclasses.replace(tiny.loss, box="giou")
+        config = dataclasses.replace(tiny, head=head, loss=loss)
+    if changed == "skip_non_finite":
+        config = dataclasses.replace(tiny, train=dataclasses.replace(tiny.train, skip_non_finite=True))
+    run = Run(config, kitti_data(scenes, config), tmp_path / "run", "cpu")
+    run.model.train()
+    batches = [batch.to(torch.device("cpu")) for batch in run.loader]
+    with mock.patch.object(Batch, "to", lambda batch, _: batch):
+        run.step(batches[0])  # makes what is made once
+        of_step = waits(lambda: run.step(batches[1]))
+    of_encoder = waits(lambda: run.model.encoder(batches[1].points, batches[1].sample, len(batches[1].boxes)))
+    assert of_step == of_encoder
+    assert set(of_encoder) == {"tolist"}
+    assert waits(run.read_steps) == ["tolist"]
+    assert sum(map(len, batches[1].boxes)) > 3
+
+
+def test_augmentation_reads_no_point(scenes: Path, tiny: Config) -> None:
+    """On the device "meta" there are shapes and no numbers: what reads one raises."""
+    meta = torch.device("meta")
+    objects = sampler_of(load_database(scenes, ["000000", "000001", "000002"], []), meta)
+    config = dataclasses.replace(tiny, augment=dataclasses.replace(tiny.augment, mix=0.5, whole_frames=0.5))
+    frames = TrainingFrames(KittiFrames(scenes, ["000000", "000001", "000002"]), config, objects, meta)
+    batch = collate([frames[epoch, k] for epoch in range(4) for k in range(3)])
+    assert isinstance(batch, Batch)
+    assert batch.points.device == batch.sample.device == meta
+    assert len(batch.points) == len(batch.sample)
+    assert {boxes.device.type for boxes in batch.boxes} == {"cpu"}
+    batch.to(meta)
