@@ -1,5 +1,6 @@
 """Anchors: where they are, boxes encoded against them, and their matching."""
 
+import dataclasses
 import math
 
 import pytest
@@ -9,7 +10,17 @@ from torch import Tensor
 from hvnet.boxes import bev_corners
 from hvnet.config import Config
 from hvnet.kernels import reference
-from hvnet.network.anchors import MAX_HEIGHT, MAX_SHIFT, MAX_SIZE, assign_targets, decode, encode, make_anchors
+from hvnet.network.anchors import (
+    MAX_HEIGHT,
+    MAX_SHIFT,
+    MAX_SIZE,
+    assign_targets,
+    boxes_of_class,
+    decode,
+    encode,
+    make_anchors,
+    positives_per_box,
+)
 
 
 def any_boxes(count: int, seed: int = 0) -> Tensor:
@@ -140,25 +151,27 @@ def test_a_nan_stays_one(values: int) -> None:
     assert decode(outputs[:0, :values], outputs[:0, values:], None, any_boxes(0)).shape == (0, 7)
 
 
-def test_assign_targets_by_hand() -> None:
+def test_assign_targets_by_hand(threads: None) -> None:
     anchors = torch.tensor([[x, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0] for x in (0.0, 1.0, 2.0, 10.0, 20.0)])
     boxes = torch.tensor([[0.4, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], [13.9, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]])
     # IoU with box 0, shifted by d: (4 - d) / (4 + d): 0.818, 0.739, 0.429, 0, 0; box 1 overlaps only anchor 3: 0.013
     targets = assign_targets(anchors, [boxes, boxes[:0]], 0.75, 0.6)
     assert targets.positive.tolist() == [[True, False, False, True, False], [False] * 5]
     assert targets.negative.tolist() == [[False, False, True, False, True], [True] * 5]
-    torch.testing.assert_close(targets.location, torch.tensor([[0.4, 0.0] * 4, [3.9, 0.0] * 4]))
+    torch.testing.assert_close(targets.location[targets.used], torch.tensor([[0.4, 0.0] * 4, [3.9, 0.0] * 4]))
+    assert targets.rows[targets.used].tolist() == [0, 3]
+    assert targets.boxes[targets.used].tolist() == boxes.tolist()
 
 
-def test_two_boxes_with_one_best_anchor() -> None:
+def test_two_boxes_with_one_best_anchor(threads: None) -> None:
     anchors = torch.tensor([[0.0, 0, 0, 4, 2, 1.5, 0], [50.0, 0, 0, 4, 2, 1.5, 0]])
     boxes = torch.tensor([[1.0, 0, 0, 4, 2, 1.5, 0], [0.5, 0, 0, 4, 2, 1.5, 0]])
     targets = assign_targets(anchors, [boxes], 0.9, 0.3)
     assert targets.positive.tolist() == [[True, False]]
-    torch.testing.assert_close(targets.location, torch.tensor([[1.0, 0.0] * 4]))
+    torch.testing.assert_close(targets.location[targets.used], torch.tensor([[1.0, 0.0] * 4]))
 
 
-def test_assign_targets_is_the_matrix_version(demo: Config) -> None:
+def test_assign_targets_is_the_matrix_version(demo: Config, threads: None) -> None:
     entry = demo.head.classes[0]
     anchors = make_anchors(demo, entry)
     boxes = any_boxes(6)
@@ -176,3 +189,46 @@ def test_assign_targets_is_the_matrix_version(demo: Config) -> None:
         assert torch.equal(targets.negative[b][compared], (iou.amax(1) < 0.35)[compared])
         for m in range(len(own)):
             assert targets.positive[b][iou[:, m] > iou[:, m].amax() - 1e-6].any()
+
+
+@pytest.mark.parametrize("regression", ["corners", "pose"])
+def test_targets_of_many_threads_are_those_of_one(
+    demo: Config, regression: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same bits in the rows that are used; the others are different anchors, matched to themselves."""
+    anchors, entry = make_anchors(demo, demo.head.classes[0]), demo.head.classes[0]
+    boxes = [any_boxes(12, seed) * torch.tensor([0.2, 0.1, 1, 1, 1, 1, 1]) for seed in range(3)]
+    boxes[1] = boxes[1][:0]
+    labels = [torch.arange(len(own)) % 3 - 1 for own in boxes]
+
+    def targets() -> tuple[Tensor, ...]:
+        own, most = boxes_of_class(boxes, labels, 0), positives_per_box(demo, entry)
+        return assign_targets(anchors, own, entry.positive_iou, entry.negative_iou, regression, most)
+
+    one = targets()
+    monkeypatch.setattr("hvnet.kernels.launch.force_many_threads", True)
+    many = targets()
+    used = many[3]
+    assert torch.equal(one[0], many[0])
+    assert torch.equal(one[1], many[1])
+    assert 0 < used.sum() < len(used)
+    for a, b in zip(one[2:], many[2:], strict=True):
+        assert torch.equal(a, b[used])
+    assert many[2][~used].unique().shape == many[2][~used].shape
+    for values in many[4:7]:
+        assert not values[~used].any()
+    assert torch.equal(many[7][~used], many[8][~used])
+
+
+@pytest.mark.parametrize("positive_iou", [0.25, 0.35, 0.5, 0.7])
+def test_no_box_has_more_positive_anchors(demo: Config, positive_iou: float, threads: None) -> None:
+    """Boxes like the anchors, which have the most, and of all sizes."""
+    entry = dataclasses.replace(demo.head.classes[1], positive_iou=positive_iou)  # the anchors are 0.4 m apart
+    anchors, most = make_anchors(demo, entry), positives_per_box(demo, entry)
+    generator = torch.Generator().manual_seed(0)
+    boxes = anchors[torch.randint(len(anchors), (600,), generator=generator)].clone()
+    boxes[:, :2] += (torch.rand(600, 2, generator=generator) - 0.5) * 0.4
+    boxes[300:, 3:5] *= 4 ** (2 * torch.rand(300, 2, generator=generator) - 1)
+    boxes[:, 6] = torch.rand(600, generator=generator) * math.pi
+    positive = assign_targets(anchors, list(boxes[:, None]), positive_iou, 0.05).positive.sum(dim=1)
+    assert most / 20 < positive.max() <= most

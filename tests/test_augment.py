@@ -305,6 +305,29 @@ def test_mixing_with_an_empty_frame_leaves_a_side() -> None:
     assert points_in_boxes(left, left_boxes).any(1).sum() == inside.sum()
 
 
+def test_many_threads_keep_rows_of_nan(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same points to the bit, in the same order, but for those in the rows of the points that are gone."""
+    names = [*("Car", "Pedestrian", "Cyclist") * 6]
+    objects = make_objects([(name, car(9.0 * (k % 6), 12.0 * (k // 6 - 1))) for k, name in enumerate(names)])
+    options = AugmentConfig(objects=COUNTS, whole_frames=0.5)
+
+    def augmented(seed: int) -> tuple[Tensor, Tensor, Tensor]:
+        generator, labels = seeded(seed), torch.arange(12) % 3
+        mixed = mix_sectors(*scene(seed), labels, (*scene(seed + 50), labels), generator)
+        return augment(*mixed, objects, options, generator, CLASSES)
+
+    one = [augmented(seed) for seed in range(8)]
+    monkeypatch.setattr("hvnet.kernels.launch.force_many_threads", True)
+    for seed, (points, boxes, labels) in enumerate(one):
+        found = augmented(seed)
+        finite = found[0].isfinite()
+        assert torch.equal(finite.any(dim=1), finite.all(dim=1))
+        assert 500 < len(points) < len(finite)
+        assert torch.equal(found[0][finite.all(dim=1)], points)
+        assert torch.equal(found[1], boxes)
+        assert torch.equal(found[2], labels)
+
+
 def test_real_frame_with_the_real_database(kitti_root: Path) -> None:
     database = sampler_of(read_database(kitti_root / "gt_database.npz"), torch.device("cpu"))
     frame = read_frame(kitti_root, "000008")

@@ -170,6 +170,7 @@ def test_whole_numbers_are_numbers(tree: dict[str, Any]) -> None:
         ("train.epochs", 0, "train.epochs", "want 1 or more"),
         ("train.batch_size", 0, "train.batch_size", "want 1 or more"),
         ("train.validate_every", 0, "train.validate_every", "want 1 or more"),
+        ("train.report_every", 0, "train.report_every", "want 1 or more"),
         ("train.warmup_steps", -1, "train.warmup_steps", "want 0 or more"),
         ("train.workers", -1, "train.workers", "want 0 or more"),
         ("train.weight_decay", -1, "train.weight_decay", "want 0 or more"),

@@ -10,7 +10,7 @@ from torch import Tensor
 from hvnet.config import Config, LossConfig, load_config
 from hvnet.kernels.rotated import rotated_iou_bev
 from hvnet.network.anchors import assign_targets
-from hvnet.network.head import HeadMaps
+from hvnet.network.head import LOCATION_VALUES, HeadMaps
 from hvnet.network.loss import class_loss, focal_loss, iou_pairs
 from hvnet.network.model import HVNet
 from tests.models import CONFIGS, some_points
@@ -71,7 +71,7 @@ def test_gradients_of_equal_and_of_distant_boxes_are_finite() -> None:
         assert moved.grad.isfinite().all()
 
 
-def test_iou_losses_of_a_class_by_hand() -> None:
+def test_iou_losses_of_a_class_by_hand(threads: None) -> None:
     """One positive anchor: 1 - IoU = 2/5, 1 - GIoU, and the branch, whose target is the IoU of 3/5."""
     entry = load_config(CONFIGS / "demo.yaml").head.classes[0]
     anchors = torch.tensor([[0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], [50.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]])
@@ -91,7 +91,7 @@ def test_iou_losses_of_a_class_by_hand() -> None:
     assert terms["localization"].item() == pytest.approx(2.0 * (1 - (3 / 13 - 2 / 15)), abs=1e-5)
 
 
-def test_learnt_weights_by_hand() -> None:
+def test_learnt_weights_by_hand(threads: None) -> None:
     """L exp(-s) + s for every term, with one s a term."""
     config = load_config(CONFIGS / "demo.yaml", ["encoder.point_range=[0, -3.2, -3, 12.8, 3.2, 2]"])
     learnt = dataclasses.replace(config, loss=dataclasses.replace(config.loss, uncertainty=True))
@@ -124,7 +124,7 @@ def test_focal_loss_by_hand() -> None:
     assert focal_loss(logits, positive, negative, 0.25, 2.0).item() == pytest.approx(expected, rel=1e-6)
 
 
-def test_class_loss_by_hand(demo: Config) -> None:
+def test_class_loss_by_hand(demo: Config, threads: None) -> None:
     entry = dataclasses.replace(demo.head.classes[0], focal_gamma=0.0, focal_alpha=0.5)
     anchors = torch.tensor([[0.0, 0, 0, 4, 2, 1.5, 0], [0.1, 0, 0, 4, 2, 1.5, 0], [50.0, 0, 0, 4, 2, 1.5, 0]])
     targets = assign_targets(anchors, [torch.tensor([[0.0, 0, 0.3, 4, 2, 1.5, 0]])], 0.5, 0.35)
@@ -140,7 +140,7 @@ def test_class_loss_by_hand(demo: Config) -> None:
     assert terms["vertical"].item() == pytest.approx(1.5 * 2 * (0.2 - 0.025) / 2)
 
 
-def test_loss_without_boxes_is_finite(demo: Config) -> None:
+def test_loss_without_boxes_is_finite(demo: Config, threads: None) -> None:
     model = HVNet(demo)
     maps = model(some_points(), torch.zeros(500, dtype=torch.int64), 1)
     terms = model.loss(maps, [torch.zeros(0, 7)], [torch.zeros(0, dtype=torch.int64)])
@@ -148,3 +148,40 @@ def test_loss_without_boxes_is_finite(demo: Config) -> None:
     loss.backward()
     assert loss.isfinite()
     assert terms["localization"] == 0
+
+
+@pytest.mark.parametrize("box", ["smooth_l1", "iou", "giou"])
+@pytest.mark.parametrize("regression", ["corners", "pose"])
+def test_losses_of_many_threads_are_those_of_one(
+    box: str, regression: str, demo: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every term, and the gradients of every map, though there is no number at all where no anchor is positive."""
+    head = dataclasses.replace(demo.head, direction=True, iou=True, regression=regression)
+    config = dataclasses.replace(demo, head=head, loss=dataclasses.replace(demo.loss, box=box))
+    model = HVNet(config)
+    generator = torch.Generator().manual_seed(0)
+    boxes = [torch.cat([model.anchors(k)[5 * b + 40 :: 60][:4] for k in range(3)]) for b in range(3)]
+    for own in boxes:
+        own[:, 3:] *= 0.9 + 0.2 * torch.rand(own[:, 3:].shape, generator=generator)
+    labels = [torch.arange(12) // 4 for _ in boxes]
+    boxes[1], labels[1] = boxes[1][:0], labels[1][:0]
+    maps, of_anchors = [], ((), (LOCATION_VALUES[regression],), (2,), (2,), ())
+    for k in range(3):
+        shapes = [(3, len(model.anchors(k)), *of_anchor) for of_anchor in of_anchors]
+        maps.append([torch.randn(shape, generator=generator) * 0.1 for shape in shapes])
+
+    def terms_and_gradients() -> tuple[dict[str, Tensor], list[Tensor]]:
+        leaves = [part.clone().requires_grad_() for of_class in maps for part in of_class]
+        terms = model.loss([HeadMaps(*leaves[k : k + 5]) for k in (0, 5, 10)], boxes, labels)
+        return terms, list(torch.autograd.grad(torch.stack(list(terms.values())).sum(), leaves))
+
+    terms, gradients = terms_and_gradients()
+    assert all(term > 0 for term in terms.values())
+    for k, of_class in enumerate(maps):  # all but the logits, where the one way has no gradient
+        for part, gradient in zip(of_class[1:], gradients[5 * k + 1 : 5 * k + 5], strict=True):
+            part[(gradient == 0).flatten(2).all(dim=2) if gradient.ndim > 2 else gradient == 0] = math.nan
+    monkeypatch.setattr("hvnet.kernels.launch.force_many_threads", True)
+    found, found_gradients = terms_and_gradients()
+    torch.testing.assert_close(found, terms, rtol=1e-6, atol=0)
+    for mine, want in zip(found_gradients, gradients, strict=True):
+        torch.testing.assert_close(mine, want, rtol=1e-6, atol=1e-9)

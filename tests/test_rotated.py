@@ -326,6 +326,30 @@ def test_match_agrees_with_iou(device: torch.device) -> None:
     assert torch.equal(best, matrix.argmax(0))
 
 
+def test_match_of_boxes_that_are_not_finite(device: torch.device, threads: None) -> None:
+    """They match nothing, and the others as without them."""
+    anchors, boxes = random_boxes(200, 16, 8).float().to(device), random_boxes(12, 17, 8).float().to(device)
+    padded = torch.full((24, 7), math.nan, device=device)
+    padded[1::2] = boxes
+    padded[0, 0], padded[2, 6], padded[4, 3] = 0.0, math.inf, math.inf
+    iou, match, best = rotated.rotated_match(anchors, boxes, torch.tensor([0, 5, 12], device=device))
+    found = rotated.rotated_match(anchors, padded, torch.tensor([0, 10, 24], device=device))
+    assert torch.equal(found[0], iou)
+    assert torch.equal(found[1], torch.where(match < 0, -1, 2 * match + 1))
+    assert torch.equal(found[2][1::2], best)
+    assert (found[2][0::2] == -1).all()
+
+
+def test_match_reads_no_box_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Many threads check no start, because that would read the device."""
+    monkeypatch.setattr("hvnet.kernels.launch.force_many_threads", True)
+    anchors, boxes = random_boxes(20, 16, 4), random_boxes(3, 17, 4)
+    expected = rotated.rotated_match(anchors, boxes, torch.tensor([0, 3]))
+    found = rotated.rotated_match(anchors, boxes, torch.tensor([-(2**30), 2**30]))
+    for mine, want in zip(found, expected, strict=True):
+        assert torch.equal(mine, want)
+
+
 def test_match_without_boxes_or_anchors(device: torch.device) -> None:
     some, none = random_boxes(3, 18).float().to(device), torch.zeros(0, 7, device=device)
     iou, match, best = rotated.rotated_match(some, none, torch.tensor([0, 0, 0], device=device))
@@ -433,11 +457,11 @@ def test_negative_size_of_many(device: torch.device) -> None:
         bad[2, column] = -1.0
         with pytest.raises(ValueError, match=r"boxes.*-1"):
             rotated.rotated_nms(bad, scores, 0.5)
-        with pytest.raises(ValueError, match=r"anchors.*-1"):
-            rotated.rotated_match(bad, good, starts.to(device))
-        with pytest.raises(ValueError, match=r"boxes.*-1"):
-            rotated.rotated_match(good, bad, starts.to(device))
-        if not many_threads(device):  # else nms_order reads nothing
+        if not many_threads(device):  # else these read nothing
+            with pytest.raises(ValueError, match=r"anchors.*-1"):
+                rotated.rotated_match(bad, good, starts.to(device))
+            with pytest.raises(ValueError, match=r"boxes.*-1"):
+                rotated.rotated_match(good, bad, starts.to(device))
             with pytest.raises(ValueError, match=r"boxes.*-1"):
                 rotated.nms_order(bad, scores, 0.5)
 

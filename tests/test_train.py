@@ -1,6 +1,7 @@
 """Training end to end on a few generated frames: what is written, that it repeats bit for bit, resuming, mistakes."""
 
 import contextlib
+import copy
 import io
 import json
 import math
@@ -11,6 +12,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,16 +22,18 @@ import pytest
 import torch
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch import Tensor
 
-from hvnet.config import TrainConfig
+from hvnet.config import Config, TrainConfig
 from hvnet.data.gt_database import read_database
 from hvnet.data.kitti import KittiFrames, read_split
 from hvnet.exceptions import InputError, Stopped
+from hvnet.kernels import launch
 from hvnet.network.checkpoint import load_checkpoint, save_checkpoint
 from hvnet.network.detector import load
 from hvnet.train import choose_out, main
 from hvnet.training import run as run_module
-from hvnet.training.batches import collate
+from hvnet.training.batches import collate, kitti_data
 from hvnet.training.run import Run, learning_rate
 from tests.helpers import ROOT, contents, same
 from tests.models import SHORT
@@ -583,25 +587,138 @@ def test_a_diverging_run_keeps_its_last_checkpoint(scenes: Path, begun: Path) ->
 
 def test_a_step_that_is_not_finite_is_left_out(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A point of absurd reflectance overflows the statistics of the batch norms, too."""
-    calls = []
-
-    def broken(samples: Any) -> Any:
-        batch = collate(samples)
-        calls.append(len(calls))
-        if calls[-1] == 1:
-            batch.points[:, 3] = 3e38
-        return batch
-
-    monkeypatch.setattr("hvnet.training.run.collate", broken)
+    made = spoil(monkeypatch, 1)
     out = tmp_path / "out"
     run(scenes, out, "train.skip_non_finite=true")
-    assert len(calls) == 4
+    assert len(made) == 4
     (line,) = (json.loads(line) for line in (out / "non_finite.jsonl").read_text().splitlines())
     assert (line["epoch"], line["step"], line["loss"]) == (1, 1, "nan")
     content = load_checkpoint(out / "checkpoint.pt")
     assert all(value.isfinite().all() for value in content["model"].values())
     assert all(math.isfinite(record["loss"]) for record in metrics(out))
     assert {int(state["step"]) for state in content["optimizer"]["state"].values()} == {3}
+
+
+def test_ten_steps_of_many_threads_are_those_of_one(
+    scenes: Path, tiny: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Augmentation, losses, gradients and the fused optimizer, but for rounding."""
+    config = replace(tiny, train=replace(tiny.train, repeat=5), augment=replace(tiny.augment, mix=0.5))
+
+    def ten_steps(out: Path) -> tuple[list[dict[str, float]], dict[str, Tensor]]:
+        training = Run(config, kitti_data(scenes, config), out)
+        training.model.train()
+        for batch in training.loader:
+            training.step(batch)
+        return training.read_steps(), training.model.state_dict()
+
+    losses, weights = ten_steps(tmp_path / "one")
+    monkeypatch.setattr(launch, "force_many_threads", True)
+    found, found_weights = ten_steps(tmp_path / "many")
+    assert len(found) == 10
+    assert found[0]["loss"] != pytest.approx(found[9]["loss"], rel=1e-3)
+    for mine, want in zip(found, losses, strict=True):
+        assert mine == pytest.approx(want, rel=1e-5)
+    torch.testing.assert_close(found_weights, weights, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_losses_are_reported_every_few_steps(
+    scenes: Path, trained: tuple[Path, str], tmp_path: Path, many: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The record is the same, also where the steps of an epoch are no multiple, or the run is resumed with another."""
+    if many:
+        monkeypatch.setattr(launch, "force_many_threads", True)
+        run(scenes, tmp_path / "whole")
+    whole = tmp_path / "whole" if many else trained[0]
+    out, reported = tmp_path / "out", []
+    plain = Run.read_steps
+
+    def read(training: Run) -> list[dict[str, float]]:
+        reported.append(len(training.unread))
+        return plain(training)
+
+    monkeypatch.setattr(Run, "read_steps", read)
+    run(scenes, out, "train.epochs=1", "train.report_every=3")
+    run(scenes, out, "train.report_every=2", resume=True)
+    assert reported == [2, 2]
+    assert metrics(out) == metrics(whole)
+    mine, want = load_checkpoint(out / "checkpoint.pt"), load_checkpoint(whole / "checkpoint.pt")
+    assert same([mine[key] for key in ("model", "optimizer")], [want[key] for key in ("model", "optimizer")])
+    reported.clear()
+    run(scenes, tmp_path / "longer", "train.repeat=4", "train.epochs=1", "train.report_every=3")
+    assert reported == [3, 3, 2]
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_a_run_goes_on_on_another_kind_of_device(
+    scenes: Path, trained: tuple[Path, str], tmp_path: Path, many: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The optimizer is fused where many threads work, whatever the checkpoint says."""
+    out = tmp_path / "out"
+    with monkeypatch.context() as patched:
+        patched.setattr(launch, "force_many_threads", not many)
+        run(scenes, out, "train.epochs=1")
+    monkeypatch.setattr(launch, "force_many_threads", many)
+    run(scenes, out, resume=True)
+    content = load_checkpoint(out / "checkpoint.pt")["optimizer"]
+    assert [group["fused"] for group in content["param_groups"]] == [True if many else None]
+    assert {int(state["step"]) for state in content["state"].values()} == {4}
+    for mine, want in zip(metrics(out), metrics(trained[0]), strict=True):
+        assert mine["loss"] == pytest.approx(want["loss"], rel=1e-5)
+
+
+def spoil(monkeypatch: pytest.MonkeyPatch, number: int) -> list[list[str]]:
+    """Gives the points of a batch absurd reflectances; returns the names of the frames of every batch."""
+    made: list[list[str]] = []
+
+    def broken(samples: Any) -> Any:
+        batch = collate(samples)
+        if len(made) == number:
+            batch.points[:, 3] = 3e38
+        made.append(batch.names)
+        return batch
+
+    monkeypatch.setattr("hvnet.training.run.collate", broken)
+    return made
+
+
+@pytest.mark.parametrize("report_every", [1, 3])
+def test_a_step_that_is_not_finite_changes_nothing(
+    scenes: Path, tiny: Config, tmp_path: Path, report_every: int, threads: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither weights nor statistics nor the optimizer, before it is read and noted by its own step and frames."""
+    made = spoil(monkeypatch, 1)
+    train = replace(tiny.train, repeat=4, epochs=1, report_every=report_every, skip_non_finite=True)
+    config = replace(tiny, train=train)
+    training = Run(config, kitti_data(scenes, config), tmp_path / "out")
+    states = []
+    plain = Run.step
+
+    def step(self: Run, batch: Any) -> None:
+        plain(self, batch)
+        states.append(copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict()["state"])))
+
+    monkeypatch.setattr(Run, "step", step)
+    training.train()
+    assert same(states[0], states[1])
+    assert not same(states[1], states[2])
+    (line,) = (json.loads(line) for line in (tmp_path / "out" / "non_finite.jsonl").read_text().splitlines())
+    assert (line["epoch"], line["step"], line["loss"], line["frames"]) == (1, 1, "nan", made[1])
+    assert math.isfinite(metrics(tmp_path / "out")[0]["loss"])
+
+
+def test_a_step_that_is_not_finite_ends_the_run_at_the_report(
+    scenes: Path, tmp_path: Path, threads: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = spoil(monkeypatch, 4)
+    out = tmp_path / "out"
+    message = r"the loss is nan and its gradient's norm nan at step 4; its frames are in "
+    with pytest.raises(InputError, match=message):
+        run(scenes, out, "train.repeat=4", "train.report_every=3")
+    assert len(made) == 6
+    assert json.loads((out / "non_finite.jsonl").read_text())["frames"] == made[4]
+    assert load_checkpoint(out / "checkpoint.pt")["step"] == 0
 
 
 # --- odd frames -------------------------------------------------------------------------------------------------------
