@@ -99,7 +99,7 @@ def voxel_means(points: Tensor, index: NestedIndex, finest: int, rows: int) -> T
 
     The sums of a coarser voxel are those of its children at the finest scale.
     """
-    scales, size = len(index.counts) - 1, chunk_of(points.device)
+    scales, size = len(index.counts) - 1, _chunk_of(points.device)
     tasks = tasks_of(size, len(points))
     means = points.new_empty(scales, rows, 4)
     sums = points.new_empty(rows, 4, dtype=torch.float64)
@@ -112,7 +112,7 @@ def voxel_means(points: Tensor, index: NestedIndex, finest: int, rows: int) -> T
     return means
 
 
-def chunk_of(device: torch.device) -> int:
+def _chunk_of(device: torch.device) -> int:
     """The points of a task: one thread takes as many as leave their features in its cache."""
     return CHUNK if many_threads(device) else 256
 
@@ -152,7 +152,7 @@ def _encode(
 ) -> None:
     """Writes M to the product from a column of vectors on, if it has rows, and G' to the rows of values that the cursor
     gives, or to those of the voxels if it is empty."""
-    count, size = features.shape[1], chunk_of(features.device)
+    count, size = features.shape[1], _chunk_of(features.device)
     lanes, tasks = lanes_of(count, features.device), tasks_of(size, len(points))
     ends = channels(ends_of(tasks, features), lanes)
     inputs = [array(scale.starts), array(scale.voxel), array(scale.voxel[:0]), array(scale.kept), array(cursor), size]

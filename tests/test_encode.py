@@ -1,12 +1,14 @@
 """The fused attention kernel against its twin: values, gradients, ties, and what it refuses."""
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 
-from hvnet.kernels import reference
+from hvnet.kernels import launch, reference
 from hvnet.kernels.encode import attend, column_sums, knowledge, write_image
-from hvnet.kernels.scatter import Segments, scatter_mean, segments
+from hvnet.kernels.scatter import CHUNK, Segments, scatter_mean, segments
 from hvnet.kernels.voxel import hash_index
 
 
@@ -27,7 +29,8 @@ def case(count: int, voxels: int, channels: int, dtype: torch.dtype, device: tor
 @pytest.mark.parametrize("relu", [True, False])
 @pytest.mark.parametrize("ordered", [True, False])
 @pytest.mark.parametrize(
-    ("count", "voxels", "channels"), [(60, 20, 32), (60, 1, 16), (1, 1, 8), (0, 3, 4), (50, 70, 7), (9, 4, 1)]
+    ("count", "voxels", "channels"),
+    [(60, 20, 32), (60, 1, 16), (1, 1, 8), (0, 3, 4), (50, 70, 7), (9, 4, 1), (200, 3, 5), (64, 2, 1)],
 )
 def test_values_and_gradients(
     count: int, voxels: int, channels: int, relu: bool, ordered: bool, device: torch.device
@@ -92,6 +95,28 @@ def test_a_tie_goes_to_the_last_point(device: torch.device) -> None:
     assert values.tolist() == [[3.0, -3.0]]
     (grad,) = torch.autograd.grad(values.sum(), features)
     assert grad.tolist() == [[0, 0], [0, 0], [1.5, -1.5]]
+
+
+@pytest.mark.parametrize("relu", [True, False])
+@pytest.mark.parametrize("ordered", [True, False])
+def test_one_thread_and_many_give_the_same_maxima(
+    relu: bool, ordered: bool, device: torch.device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Voxels longer than what a thread takes, some without points, ties between parts, and a NaN in one of them."""
+    cpu = torch.device("cpu")
+    for count, voxels in ((500, 3), (96, 3), (97, 200), (CHUNK, 1), (CHUNK + 1, 1), (0, 2)):
+        features, points, mean, layer, at = case(count, voxels, 3, torch.float32, cpu, ordered)
+        features = (4 * features).round() / 4  # equal values
+        if count:
+            points, mean, layer = points.round(), mean.round(), layer.round()
+            features[count // 2, 1] = math.nan
+        inputs = features, points, mean, layer, at.voxel, at.order, at.starts, relu, True
+        monkeypatch.setattr(launch, "force_many_threads", False)
+        want = torch.ops.hvnet.attend(*inputs)
+        monkeypatch.setattr(launch, "force_many_threads", True)
+        got = torch.ops.hvnet.attend(*(x.to(device) if isinstance(x, Tensor) else x for x in inputs))
+        for a, b in zip(got, want, strict=True):
+            torch.testing.assert_close(a.cpu(), b, rtol=0, atol=0, equal_nan=True)
 
 
 @pytest.mark.parametrize(("count", "channels"), [(5000, 32), (1024, 7), (1, 16), (0, 4), (3, 0)])

@@ -362,6 +362,24 @@ def test_no_gradient_wanted(device: torch.device) -> None:
     assert not scatter.scatter_mean(src.detach(), index, 2).requires_grad
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_segments_longer_than_a_share(dtype: torch.dtype, device: torch.device) -> None:
+    """Rows that many threads cut: of several shares, of one to the point, with empty rows and what is not finite."""
+    size = scatter.CHUNK
+    generator = torch.Generator().manual_seed(0)
+    for count, dim_size in ((40 * size, 3), (3 * size, 3), (size, 1), (size + 1, 1), (3 * size + 1, 200)):
+        even = torch.arange(count) * dim_size // count
+        for index in (even, torch.randint(dim_size, (count,), generator=generator)):
+            src = torch.randint(-4, 4, (count, 5), generator=generator).to(dtype)
+            for value in (0.0, NAN, INF):
+                src[torch.randint(count, (3,), generator=generator), torch.arange(3)] = value
+                inputs = src.to(device), index.to(device), dim_size
+                for got, want in zip(scatter.scatter_max(*inputs), reference.scatter_max(*inputs), strict=True):
+                    torch.testing.assert_close(got, want, rtol=0, atol=0, equal_nan=True)
+                mean = scatter.scatter_mean(*inputs)
+                torch.testing.assert_close(mean, reference.scatter_mean(*inputs), equal_nan=True)
+
+
 def test_segments_at_hand(device: torch.device) -> None:
     """Points that already stand voxel by voxel need no order."""
     src, index, dim_size = random_case(200, 19, 40)
