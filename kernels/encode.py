@@ -18,7 +18,8 @@ import warp as wp
 from torch import Tensor
 
 from hvnet.kernels.launch import FLOATS, WARP_FLOAT, array, channels, check_tensor, lanes_of, launch, many_threads
-from hvnet.kernels.scatter import CHUNK, Segments, cut_voxel, ends_of, order_array, point_at, share_of, tasks_of
+from hvnet.kernels.scatter import Segments
+from hvnet.kernels.shares import CHUNK, cut_voxel, ends_of, order_array, point_at, share_of, tasks_of
 from hvnet.kernels.voxel import NestedIndex
 
 ROWS = 1024  # rows that are summed as one block
@@ -309,7 +310,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         ends_argmax: wp.array3d(dtype=int_vec),
     ):
         task, c = wp.tid()
-        share = share_of(task, CHUNK, points.shape[0], mean.shape[0], voxel, order, starts)
+        share = share_of(task, CHUNK, points.shape[0], mean.shape[0], voxel, order)
         first, last = share[0], share[1]
         w0 = weight[0, c]
         w1 = weight[1, c]
@@ -407,7 +408,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         block, c = wp.tid()
         share = wp.vec4i(0, points.shape[0], block * VOXELS, wp.min((block + 1) * VOXELS, mean.shape[0]))
         if size > 0:
-            share = share_of(block, size, points.shape[0], mean.shape[0], voxel, order, starts)
+            share = share_of(block, size, points.shape[0], mean.shape[0], voxel, order)
         w0 = weight[0, c]
         w1 = weight[1, c]
         w2 = weight[2, c]

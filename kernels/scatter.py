@@ -28,6 +28,7 @@ from hvnet.kernels.launch import (
     launch,
     many_threads,
 )
+from hvnet.kernels.shares import CHUNK, cut_voxel, ends_of, order_array, point_at, share_of, tasks_of
 
 
 class Segments(NamedTuple):
@@ -104,78 +105,6 @@ def _segments_of(src: Tensor, index: Tensor, dim_size: int) -> Segments:
     return segments(index, dim_size)
 
 
-CHUNK = wp.constant(32)
-"""Consecutive points that one of many threads takes."""
-
-
-@wp.func
-def point_at(order: wp.array(dtype=wp.int64), k: int):
-    """The k-th point in the order of the voxels; an empty order is that of the points."""
-    i = k
-    if order.shape[0] > 0:
-        i = int(order[k])
-    return i
-
-
-@wp.func
-def share_of(
-    task: int,
-    size: int,
-    count: int,
-    voxels: int,
-    voxel: wp.array(dtype=wp.int64),
-    order: wp.array(dtype=wp.int64),
-    starts: wp.array(dtype=wp.int64),
-):
-    """A task's `size` of `count` points: from, to; and its voxels: from, to. Ends are not included.
-
-    Voxels without points belong to the task of the next point, those after the last point to the last task.
-    """
-    first = task * size
-    last = wp.min(first + size, count)
-    share = wp.vec4i(first, last, 0, voxels)
-    if first >= last and task > 0:
-        share = wp.vec4i(0, 0, 0, 0)
-    elif first < last:
-        begin = int(0)
-        end = voxels
-        if task > 0:
-            begin = wp.min(int(voxel[point_at(order, first - 1)]) + 1, int(voxel[point_at(order, first)]))
-        if last < count:
-            end = int(voxel[point_at(order, last - 1)]) + 1
-        share = wp.vec4i(first, last, begin, end)
-    return share
-
-
-@wp.func
-def cut_voxel(
-    task: int,
-    size: int,
-    count: int,
-    voxel: wp.array(dtype=wp.int64),
-    order: wp.array(dtype=wp.int64),
-    starts: wp.array(dtype=wp.int64),
-):
-    """The voxel that begins in a task's share and goes on beyond it; -1 if there is none."""
-    cut = int(-1)
-    last = (task + 1) * size
-    if last < count:
-        v = int(voxel[point_at(order, last - 1)])
-        if int(starts[v]) >= task * size and int(starts[v + 1]) > last:
-            cut = v
-    return cut
-
-
-def tasks_of(size: int, points: int) -> int:
-    """The tasks that share the points, one at least: voxels without points are its work as well."""
-    return max(1, -(-points // size))
-
-
-def ends_of(tasks: int, like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-    """Room (2, tasks, C) for what a task finds of a voxel that began before it, and of one that goes on after it."""
-    return like.new_empty(2, tasks, like.shape[1], dtype=dtype)
-
-
 @functools.cache
 def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
     """The kernels for one floating type and vector length, in a module of their own."""
@@ -230,7 +159,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         argmax: wp.array2d(dtype=int_vec),
     ):
         task, c = wp.tid()
-        share = share_of(task, CHUNK, src.shape[0], values.shape[0], voxel, order, starts)
+        share = share_of(task, CHUNK, src.shape[0], values.shape[0], voxel, order)
         first, last = share[0], share[1]
         for v in range(share[2], share[3]):
             begin, end = int(starts[v]), int(starts[v + 1])
@@ -358,7 +287,7 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         values: wp.array2d(dtype=vec),
     ):
         task, c = wp.tid()
-        share = share_of(task, CHUNK, src.shape[0], values.shape[0], voxel, order, starts)
+        share = share_of(task, CHUNK, src.shape[0], values.shape[0], voxel, order)
         first, last = share[0], share[1]
         for v in range(share[2], share[3]):
             begin, end = int(starts[v]), int(starts[v + 1])
@@ -411,11 +340,6 @@ def _kernels(dtype: Any, lanes: int) -> SimpleNamespace:
         total_of_chunk=total_of_chunk,
         total_join=total_join,
     )
-
-
-def order_array(order: Tensor | None, like: Tensor) -> Any:
-    """A Warp view of an order (N,), empty where the points are in order already."""
-    return array(like.new_empty(0) if order is None else order.contiguous())
 
 
 def _segments_outputs(index: Tensor, dim_size: int) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from hvnet.kernels import launch, reference
 from hvnet.kernels.encode import attend, column_sums, knowledge, write_image
-from hvnet.kernels.scatter import CHUNK, Segments, scatter_mean, segments
+from hvnet.kernels.scatter import Segments, scatter_mean, segments
+from hvnet.kernels.shares import CHUNK
 from hvnet.kernels.voxel import hash_index
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from hvnet.kernels import reference, scatter
+from hvnet.kernels.shares import CHUNK
 
 INF, NAN = math.inf, math.nan
 DTYPES = (torch.float32, torch.float64)
@@ -365,7 +366,7 @@ def test_no_gradient_wanted(device: torch.device) -> None:
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_segments_longer_than_a_share(dtype: torch.dtype, device: torch.device) -> None:
     """Rows that many threads cut: of several shares, of one to the point, with empty rows and what is not finite."""
-    size = scatter.CHUNK
+    size = CHUNK
     generator = torch.Generator().manual_seed(0)
     for count, dim_size in ((40 * size, 3), (3 * size, 3), (size, 1), (size + 1, 1), (3 * size + 1, 200)):
         even = torch.arange(count) * dim_size // count
