@@ -158,9 +158,9 @@ def test_assign_targets_by_hand(threads: None) -> None:
     targets = assign_targets(anchors, [boxes, boxes[:0]], 0.75, 0.6)
     assert targets.positive.tolist() == [[True, False, False, True, False], [False] * 5]
     assert targets.negative.tolist() == [[False, False, True, False, True], [True] * 5]
-    torch.testing.assert_close(targets.location[targets.used], torch.tensor([[0.4, 0.0] * 4, [3.9, 0.0] * 4]))
-    assert targets.rows[targets.used].tolist() == [0, 3]
-    assert targets.boxes[targets.used].tolist() == boxes.tolist()
+    torch.testing.assert_close(targets.location[~targets.unused], torch.tensor([[0.4, 0.0] * 4, [3.9, 0.0] * 4]))
+    assert targets.rows[~targets.unused].tolist() == [0, 3]
+    assert targets.boxes[~targets.unused].tolist() == boxes.tolist()
 
 
 def test_two_boxes_with_one_best_anchor(threads: None) -> None:
@@ -168,7 +168,7 @@ def test_two_boxes_with_one_best_anchor(threads: None) -> None:
     boxes = torch.tensor([[1.0, 0, 0, 4, 2, 1.5, 0], [0.5, 0, 0, 4, 2, 1.5, 0]])
     targets = assign_targets(anchors, [boxes], 0.9, 0.3)
     assert targets.positive.tolist() == [[True, False]]
-    torch.testing.assert_close(targets.location[targets.used], torch.tensor([[1.0, 0.0] * 4]))
+    torch.testing.assert_close(targets.location[~targets.unused], torch.tensor([[1.0, 0.0] * 4]))
 
 
 def test_assign_targets_is_the_matrix_version(demo: Config, threads: None) -> None:
@@ -208,10 +208,11 @@ def test_targets_of_many_threads_are_those_of_one(
     one = targets()
     monkeypatch.setattr("hvnet.kernels.launch.force_many_threads", True)
     many = targets()
-    used = many[3]
+    used = ~many[3]
     assert torch.equal(one[0], many[0])
     assert torch.equal(one[1], many[1])
     assert 0 < used.sum() < len(used)
+    assert not one[3].any()
     for a, b in zip(one[2:], many[2:], strict=True):
         assert torch.equal(a, b[used])
     assert many[2][~used].unique().shape == many[2][~used].shape

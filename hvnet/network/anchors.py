@@ -33,13 +33,13 @@ class Targets(NamedTuple):
     """Targets of the anchors of one class over a batch, and P rows for the positive ones, in the order of nonzero().
 
     One thread has as many rows as positive anchors. Many threads read no number from the device: they have as many rows
-    as there can be, and those that are not used are anchors matched to themselves, whose targets are 0.
+    as there can be, and the unused ones are anchors matched to themselves, whose targets are 0.
     """
 
     positive: Tensor  # (B, A) bool
     negative: Tensor  # (B, A) bool; anchors that are neither are ignored
     rows: Tensor  # (P,) int64, indices into the B * A anchors
-    used: Tensor  # (P,) bool
+    unused: Tensor  # (P,) bool
     location: Tensor  # (P, 8) metres, or (P, 5)
     vertical: Tensor  # (P, 2)
     direction: Tensor  # (P,) int64
@@ -193,22 +193,23 @@ def assign_targets(
     positive = (iou > positive_iou) | is_forced
     negative = (iou < negative_iou) & ~positive
     most = positive.numel() if per_box is None else sum(map(len, boxes)) * per_box
-    rows, used = true_rows(positive, most)
+    rows, unused = true_rows(positive, most)
     of_positive = anchors[rows % len(anchors)]
     matched = every.view(-1, 7)[match.flatten()[rows].clamp(min=0)] if count else of_positive
-    matched = torch.where(used[:, None], matched, of_positive)
-    return Targets(positive, negative, rows, used, *encode(matched, of_positive, regression), of_positive, matched)
+    matched = torch.where(unused[:, None], of_positive, matched)
+    return Targets(positive, negative, rows, unused, *encode(matched, of_positive, regression), of_positive, matched)
 
 
 def true_rows(mask: Tensor, most: int) -> tuple[Tensor, Tensor]:
-    """The indices (P,) int64 into the flat mask where it is true, and which of them are used (P,) bool.
+    """The indices (P,) int64 into the flat mask where it is true, and which of them are unused (P,) bool.
 
     Many threads, which read no number from the device, have min(most, size of the mask) of them, more than there are
-    true ones; those that are not used are all different.
+    true ones; the unused ones are all different.
     """
     mask = mask.flatten()
     if not many_threads(mask.device):
         rows = mask.nonzero().squeeze(1)
-        return rows, torch.ones_like(rows, dtype=torch.bool)
-    rows = mask.nonzero_static(size=min(most, len(mask))).squeeze(1)
-    return torch.where(rows < 0, torch.arange(len(rows), device=mask.device), rows), rows >= 0
+        return rows, torch.zeros_like(rows, dtype=torch.bool)
+    rows = mask.nonzero_static(size=min(most, len(mask))).squeeze(1)  # -1 behind the last
+    unused = rows < 0
+    return torch.where(unused, torch.arange(len(rows), device=mask.device), rows), unused

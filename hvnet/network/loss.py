@@ -12,7 +12,7 @@ from hvnet.network.anchors import Targets, decode
 from hvnet.network.head import HeadMaps
 from hvnet.ranks import all_reduce
 
-IGNORED = -100  # the direction of a row that is not used
+IGNORED = -100  # the direction of an unused row
 
 
 def focal_loss(logits: Tensor, positive: Tensor, negative: Tensor, alpha: float, gamma: float) -> Tensor:
@@ -32,29 +32,29 @@ def class_loss(maps: HeadMaps, targets: Targets, entry: ClassConfig, weights: Lo
         box = smooth_l1(location, targets.location)
     else:
         overlap = iou_pairs(targets.boxes, decode(location, vertical, None, targets.anchors), weights.box == "giou")
-        box = ((1 - overlap) * targets.used).sum()
+        box = (1 - overlap).masked_fill(targets.unused, 0.0).sum()
     terms = {
         "classification": weights.classification * focal,
         "localization": weights.localization * box,
         "vertical": weights.vertical * smooth_l1(vertical, targets.vertical),
     }
     if maps.direction is not None:
-        bins = targets.direction.masked_fill(~targets.used, IGNORED)
+        bins = targets.direction.masked_fill(targets.unused, IGNORED)
         direction = F.cross_entropy(rows_of(maps.direction, targets), bins, reduction="sum", ignore_index=IGNORED)
         terms["direction"] = weights.direction * direction
     if maps.iou is not None:
         with torch.no_grad():
             overlap = iou_pairs(targets.boxes, decode(location, vertical, None, targets.anchors))
-        used = targets.used.to(overlap.dtype)
-        iou = F.binary_cross_entropy_with_logits(rows_of(maps.iou, targets), overlap, used, reduction="sum")
+        iou = F.binary_cross_entropy_with_logits(rows_of(maps.iou, targets), overlap, reduction="none")
+        iou = iou.masked_fill(targets.unused, 0.0).sum()
         terms["iou"] = weights.iou * iou
     return {name: term / positives for name, term in terms.items()}
 
 
 def rows_of(values: Tensor, targets: Targets) -> Tensor:
-    """The rows (P, ...) of a map (B, A, ...); those not used are 0, as their targets are, and pass no gradient on."""
+    """The rows (P, ...) of a map (B, A, ...); unused ones are 0, as their targets are, and pass no gradient on."""
     rows = values.flatten(0, 1)[targets.rows]
-    return rows.masked_fill(~targets.used.view(-1, *(1,) * (rows.ndim - 1)), 0.0)
+    return rows.masked_fill(targets.unused if rows.ndim == 1 else targets.unused[:, None], 0.0)
 
 
 def iou_pairs(a: Tensor, b: Tensor, generalized: bool = False) -> Tensor:
