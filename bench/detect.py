@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from timing import agree, parser, read_scene, start, synchronise, write_rows
+from timing import agree, parser, read_scene, start, synchronise, write_json, write_rows
 from torch import Tensor
 
 from hvnet.cli import run_command
@@ -172,6 +172,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 row = {"config": name, "batch": 1, "dtype": str(detector.dtype)}
                 rows += print_times(f"{name}, whole scan of {len(scan):,} points", whole, tuple(whole), 1, row)
     write_rows(args.csv, rows, bench.machine)
+    write_json(args.json, rows, bench.machine)
 
 
 if __name__ == "__main__":

@@ -113,10 +113,7 @@ class Bench:
             for row in self.rows
         ]
         write_rows(csv_file, rows, self.machine)
-        if json_file:
-            tree = {"machine": self.machine, "rows": [asdict(row) for row in self.rows]}
-            json_file.write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
-            print(f"written: {json_file}")
+        write_json(json_file, [asdict(row) for row in self.rows], self.machine)
 
 
 def in_turns(providers: dict[str, Run], repeat: int, device: torch.device) -> dict[str, list[float]]:
@@ -174,6 +171,13 @@ def write_rows(path: Path | None, rows: list[dict[str, object]], machine: dict[s
     print(f"\nwritten: {path}")
 
 
+def write_json(path: Path | None, rows: list[dict[str, object]], machine: dict[str, str | int | float]) -> None:
+    """Writes rows and the machine as JSON; nothing without a path."""
+    if path is not None:
+        path.write_text(json.dumps({"machine": machine, "rows": rows}, indent=1) + "\n", encoding="utf-8")
+        print(f"written: {path}")
+
+
 def peak_memory(run: Run, device: torch.device) -> float:
     """Bytes that torch's allocator holds more than before at the highest moment of a call."""
     gc.collect()
@@ -209,8 +213,21 @@ def measure_peak(device: torch.device) -> Peak:
     target = torch.empty_like(source)
     matrix = torch.ones(4096 if large else 1024, 4096 if large else 1024, device=device)
     copy = min(timed(lambda: target.copy_(source), device) for _ in range(10))
-    product = min(timed(lambda: matrix @ matrix, device) for _ in range(10))
-    return Peak(2 * source.numel() * source.element_size() / copy, 2 * len(matrix) ** 3 / product)
+    return Peak(2 * source.numel() * source.element_size() / copy, measure_product(matrix, "ieee"))
+
+
+def measure_product(matrix: Tensor, precision: str) -> float:
+    """Operations a second of the best of ten products of a matrix with itself: in "ieee" float32, or in "tf32".
+
+    A GPU's environment may have chosen either, so that it is said here.
+    """
+    products = torch.backends.cuda.matmul
+    before, products.fp32_precision = products.fp32_precision, precision
+    try:
+        seconds = min(timed(lambda: matrix @ matrix, matrix.device) for _ in range(10))
+    finally:
+        products.fp32_precision = before
+    return 2 * len(matrix) ** 3 / seconds
 
 
 def agree(what: str, got: Sequence[Tensor], want: Sequence[Tensor], rtol: float, atol: float) -> None:
@@ -281,6 +298,8 @@ def start(name: str, args: argparse.Namespace) -> Bench:
         "product_gflop_s": round(peak.product / 1e9, 1),
         "python": platform.python_version(),
     }
+    if device.type == "cuda":
+        machine["tf32_gflop_s"] = round(measure_product(torch.ones(4096, 4096, device=device), "tf32") / 1e9, 1)
     for package in PACKAGES:
         try:
             machine[package] = version(package)

@@ -15,7 +15,7 @@ from unittest import mock
 
 import numpy as np
 import torch
-from timing import parser, start, synchronise, write_rows
+from timing import parser, start, synchronise, write_json, write_rows
 
 from hvnet.cli import run_command
 from hvnet.config import load_config
@@ -135,6 +135,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 rows.append(row | {"p50_ms": f"{p50:.6g}", "p95_ms": f"{p95:.6g}", "steps": args.repeat})
             sys.stdout.flush()
     write_rows(args.csv, rows, bench.machine)
+    write_json(args.json, rows, bench.machine)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Fixtures for all tests: unwritten memory is seen, the real KITTI frames are found or skipped."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from hvnet.network.model import HVNet
 from tests.helpers import SHARED
 from tests.models import CONFIGS, NARROW, SHORT
 
+os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # without it, products on CUDA are refused as not repeating
 torch.utils.deterministic.fill_uninitialized_memory = True
 torch.use_deterministic_algorithms(True)  # with it, torch.empty is filled with NaN or the largest integer
 torch.set_num_threads(1)  # the networks here are small: threads cost more than they save where others use the cores

@@ -168,9 +168,12 @@ def test_shares(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_stages_of_the_detector(tmp_path: Path) -> None:
     file = tmp_path / "rows.csv"
-    done = bench("detect", "--configs", "demo", "--batch", "1", "2", "--repeat", "2", "--csv", str(file))
+    files = ["--csv", str(file), "--json", f"{file}.json"]
+    done = bench("detect", "--configs", "demo", "--batch", "1", "2", "--repeat", "2", *files)
     assert done.returncode == 0, done.stdout + done.stderr
     rows = read_rows(file)
+    written = json.loads(Path(f"{file}.json").read_text(encoding="utf-8"))["rows"]
+    assert [row["p50_ms"] for row in written] == [row["p50_ms"] for row in rows]
     stages = ["read", "encode", "backbone", "heads", "decode", "NMS", "detector", "plain model"]
     assert [row["stage"] for row in rows] == 2 * stages
     assert all(0 < float(row["p50_ms"]) <= float(row["p95_ms"]) for row in rows)
@@ -178,9 +181,12 @@ def test_stages_of_the_detector(tmp_path: Path) -> None:
 
 def test_stages_of_training(tmp_path: Path) -> None:
     file = tmp_path / "rows.csv"
-    done = bench("train", "--configs", "demo", "--repeat", "2", "--csv", str(file))
+    done = bench("train", "--configs", "demo", "--repeat", "2", "--csv", str(file), "--json", f"{file}.json")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "frames/s" in done.stdout
     rows = {row["stage"]: float(row["p50_ms"]) for row in read_rows(file)}
     assert list(rows) == ["data", "encoder", "backbone and heads", "loss", "backward", "optimiser", "step"]
+    tree = json.loads(Path(f"{file}.json").read_text(encoding="utf-8"))
+    assert {row["stage"]: float(row["p50_ms"]) for row in tree["rows"]} == rows
+    assert set(tree["machine"]) >= MACHINE
     assert 0.5 < rows.pop("step") / sum(rows.values()) < 1.5

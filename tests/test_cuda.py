@@ -1,8 +1,8 @@
 """What only a GPU can show: training, detection, graphs, streams and devices, against the CPU.
 
-The kernels' own tests run on CUDA as well, by the fixture `device`. Between CPU and CUDA only integers are promised to be
-the same, and arg-maxima of the same inputs; floats are close: a GPU contracts a * b + c into one operation, and its sine
-and cosine are others. Two runs on one GPU give the same bits. Convolutions are compared without TF32.
+The kernels' own tests run on CUDA as well, by the fixture `device`. Of CPU and CUDA only integers are promised to be
+the same, and arg-maxima of the same inputs; floats are close: a GPU contracts a * b + c into one operation, and it has
+another sine and cosine. Two runs on one GPU give the same bits. Convolutions are compared without TF32.
 """
 
 import copy
@@ -47,7 +47,8 @@ from tests.models import CONFIGS, NARROW, SHORT, lively, some_clouds, some_point
 pytestmark = [pytest.mark.cuda, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 
 GPU, CPU = torch.device("cuda"), torch.device("cpu")
-LOSS = 1e-4  # relative; perturbing every weight by 1e-7 of itself moves it by less
+# weights that are off by 3e-7 of themselves stay within both on a CPU; by 3e-6 one case does not
+LOSS = 1e-4  # relative
 GRADIENT = 1e-2  # of the norm: where two points tie but for rounding, the whole gradient goes to another one
 RAYS = 1_000_000  # enough to keep a GPU busy for milliseconds
 WAITS = 2  # that a step of training may make the host wait for the device
@@ -635,8 +636,7 @@ def test_a_second_device(second: torch.device, street: Tensor, demo: Config) -> 
     mesh = torch.randn(90, 3), torch.arange(90).view(-1, 3), torch.zeros(50, 3), directions
     equal([raycast(*(tensor.to(second) for tensor in mesh), 9.0)[1]], [raycast(*mesh, 9.0)[1]])
     assert torch.cuda.current_device() == 0
-    losses, gradients, _ = losses_of(model, second)
-    near_in_norm(gradients, losses_of(model, CPU)[1], GRADIENT)
+    near_in_norm(losses_of(model, second)[1], losses_of(model, CPU)[1], GRADIENT)
     assert torch.cuda.current_device() == 0
     with pytest.raises(ValueError, match="want device"):
         scatter_max(src, index.to(GPU), 700)
