@@ -48,6 +48,7 @@ import matplotlib.pyplot as plt
 
 VALUES = {"rtol": 1e-4, "atol": 2e-6}  # float32 sums in another order; atol is a share of the largest value
 TRAINED = {"rtol": 1e-4, "atol": 5e-5}  # float32 statistics over all rows: either provider is off float64 by 2e-5
+IN_TF32 = {"rtol": 1e-4, "atol": 2e-3}  # a GPU's inference multiplies H in TF32: off by 4e-4, by 8e-4 in small encoders
 GRADIENTS = 5e-3  # of the norm
 PATIENCE = 60.0  # seconds a call; a provider that would take longer is left out of the plot from there on
 
@@ -225,12 +226,15 @@ def compare(bench: Bench, stage: str, providers: dict[str, Provider], work: Work
     *others, (_, last) = providers.items()
     with torch.set_grad_enabled(training):
         want = last.run()
+        tolerance = TRAINED if training else VALUES
+        if not training and bench.device.type == "cuda" and stage in ("AVFEO", "encoder"):
+            tolerance = IN_TF32
         given = [torch.randn_like(out) for out in want]  # gradient of every output, in the output's memory layout
         slopes = torch.autograd.grad(want, last.inputs, given) if training else ()
         for name, provider in others:
             got = provider.run()
             shown = provider.pick(got)
-            agree(f"{stage}, {name}, values", shown, want, **(TRAINED if training else VALUES))
+            agree(f"{stage}, {name}, values", shown, want, **tolerance)
             if training:
                 slope = torch.autograd.grad(got, provider.inputs, given)
                 agree_in_norm(f"{stage}, {name}, gradients", slope, slopes, GRADIENTS)
