@@ -24,9 +24,10 @@ def limit_angle(angle: Tensor) -> Tensor:
 
 def bev_corners(boxes: Tensor) -> Tensor:
     """Corners of boxes (..., 7) in bird's eye view: (..., 4, 2), front-left, front-right, rear-right, rear-left."""
-    # 0.5, 0.5, -0.5, -0.5; made there, as constants would be copied to a GPU
-    signs = (0.5 - torch.arange(4, device=boxes.device) // 2).to(boxes.dtype)
-    along, across = signs * boxes[..., 3:4], signs.roll(-1) * boxes[..., 4:5]
+    # halves are exact, and no constant is copied to a GPU
+    length, width = boxes[..., 3:4] / 2, boxes[..., 4:5] / 2
+    along = torch.cat((length, length, -length, -length), dim=-1)
+    across = torch.cat((width, -width, -width, width), dim=-1)
     cos, sin = boxes[..., 6:7].cos(), boxes[..., 6:7].sin()
     x = boxes[..., 0:1] + along * cos - across * sin
     y = boxes[..., 1:2] + along * sin + across * cos

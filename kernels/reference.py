@@ -216,6 +216,20 @@ def rotated_nms(boxes: Tensor, scores: Tensor, iou_threshold: float) -> Tensor:
     return torch.tensor(kept, dtype=torch.int64, device=boxes.device)
 
 
+def nms_groups(boxes: Tensor, valid: Tensor, counts: Tensor, iou_thresholds: Tensor, limit: int) -> Tensor:
+    """Which boxes (G, M, 7) are kept (G, M): of the first counts[g] of a group g that are valid, from the first on, all
+    whose IoU with those kept before does not exceed iou_thresholds[g % T], `limit` at most."""
+    keep = torch.zeros_like(valid)
+    for g, rows in enumerate(boxes.tolist()):
+        kept: list[int] = []
+        for k in valid[g, : int(counts[g])].nonzero()[:, 0].tolist():
+            threshold = iou_thresholds[g % len(iou_thresholds)]
+            if len(kept) < limit and all(_iou_bev(rows[k], rows[better]) <= threshold for better in kept):
+                kept.append(k)
+        keep[g, kept] = True
+    return keep
+
+
 def _box_of(row: Sequence[float], degrees: bool) -> Box:
     """The box of (cx, cy, w, h, angle), with the y axis of an image, which points down, turned up."""
     cx, cy, w, h, angle = row

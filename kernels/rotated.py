@@ -131,15 +131,30 @@ def _kernels(dtype: Any) -> SimpleNamespace:
         i = wp.tid()
         area[i] = overlap(a, i, b, i)
 
+    @wp.func
+    def iou_in_group(boxes: wp.array3d(dtype=dtype), g: int, i: int, j: int):
+        return iou_bev(boxes[g], i, boxes[g], j)
+
     @wp.kernel(enable_backward=False, module=module)
-    def nms_mask(boxes: wp.array2d(dtype=dtype), threshold: dtype, mask: wp.array2d(dtype=wp.int64)):
-        i, word = wp.tid()
-        bits = wp.int64(0)
-        for bit in range(WORD):
-            j = word * WORD + bit
-            if j > i and j < boxes.shape[0] and iou_bev(boxes, i, boxes, j) > threshold:
-                bits = bits | (wp.int64(1) << wp.int64(bit))
-        mask[i, word] = bits
+    def nms_mask(
+        boxes: wp.array3d(dtype=dtype),
+        counts: wp.array(dtype=wp.int32),
+        thresholds: wp.array(dtype=dtype),
+        mask: wp.array3d(dtype=wp.int64),
+        keep: wp.array2d(dtype=wp.bool),
+    ):
+        """Which of the WORD boxes of a word box i overlaps; what no sweep reads is not written."""
+        g, i, word = wp.tid()
+        if word == 0:
+            keep[g, i] = False  # until the sweep says otherwise
+        if i < counts[g] and word >= i // WORD and word * WORD < counts[g]:
+            threshold = thresholds[g % thresholds.shape[0]]
+            bits = wp.int64(0)
+            for bit in range(WORD):
+                j = word * WORD + bit
+                if j > i and j < counts[g] and iou_in_group(boxes, g, i, j) > threshold:
+                    bits = bits | (wp.int64(1) << wp.int64(bit))
+            mask[g, i, word] = bits
 
     @wp.kernel(enable_backward=False, module=module)
     def nms_greedy(boxes: wp.array2d(dtype=dtype), threshold: dtype, keep: wp.array(dtype=wp.bool)):
@@ -179,16 +194,55 @@ def _kernels(dtype: Any) -> SimpleNamespace:
     )
 
 
+@wp.func_native(
+    """
+#if defined(__CUDA_ARCH__)
+return __shfl_sync(0xffffffffu, value, lane);
+#else
+return value;
+#endif
+"""
+)
+def _of_lane(value: wp.int64, lane: int) -> wp.int64: ...  # type: ignore[empty-body]
+
+
 @wp.kernel(enable_backward=False, module="unique")
-def _nms_sweep(mask: wp.array2d(dtype=wp.int64), removed: wp.array(dtype=wp.int64), keep: wp.array(dtype=wp.bool)):
-    """Goes through the boxes that may be kept, best first; each that is kept removes those that its mask names."""
-    for i in range(mask.shape[0]):
-        word = i // WORD
-        kept = keep[i] and ((removed[word] >> wp.int64(i - word * WORD)) & wp.int64(1)) == wp.int64(0)
-        keep[i] = kept
-        if kept:
-            for k in range(word, mask.shape[1]):
-                removed[k] = removed[k] | mask[i, k]
+def _nms_sweep(
+    mask: wp.array3d(dtype=wp.int64),
+    valid: wp.array2d(dtype=wp.bool),
+    counts: wp.array(dtype=wp.int32),
+    limit: int,
+    lanes: int,
+    removed: wp.array2d(dtype=wp.int64),
+    keep: wp.array2d(dtype=wp.bool),
+):
+    """Goes through the boxes of a group, best first; each that is kept removes those that its mask names.
+
+    The lanes of a warp share the words: each marks in its own what is removed, and shows the others the word that the
+    walk has come to.
+    """
+    g, lane = wp.tid()
+    count = counts[g]
+    words = (count + WORD - 1) // WORD
+    for k in range(lane, words, lanes):
+        removed[g, k] = wp.int64(0)
+    kept = int(0)
+    word = int(0)
+    while word < words and kept < limit:
+        gone = wp.int64(0)
+        if word % lanes == lane:
+            gone = removed[g, word]
+        gone = _of_lane(gone, word % lanes)
+        for bit in range(WORD):
+            i = word * WORD + bit
+            if i < count and kept < limit and ((gone >> wp.int64(bit)) & wp.int64(1)) == wp.int64(0) and valid[g, i]:
+                kept += 1
+                gone = gone | mask[g, i, word]
+                if lane == 0:
+                    keep[g, i] = True
+                for k in range(word + 1 + (lane + lanes - (word + 1) % lanes) % lanes, words, lanes):
+                    removed[g, k] = removed[g, k] | mask[g, i, k]
+        word += 1
 
 
 def rotated_iou_bev(a: Tensor, b: Tensor) -> Tensor:
@@ -238,6 +292,28 @@ def nms_order(boxes: Tensor, scores: Tensor, iou_threshold: float) -> tuple[Tens
     """
     _check_scored(boxes, scores, iou_threshold, 7)
     return _nms_order(boxes.detach(), scores.detach(), float(iou_threshold))
+
+
+def nms_groups(boxes: Tensor, valid: Tensor, counts: Tensor, iou_thresholds: Tensor, limit: int) -> Tensor:
+    """Greedy NMS of G groups of boxes (G, M, 7) at once, each with its best box first: which are kept (G, M) bool.
+
+    valid: (G, M) bool; a box that is not is not kept and drops none
+    counts: (G,) int32, at most M: the boxes of each group, those after them only fill up the array
+    iou_thresholds: (T,) of the boxes' dtype; group g has the threshold g % T
+    limit: how many boxes of a group are kept at most
+
+    Nothing is read from the device. Boxes may be a part of wider rows. Raises TypeError or ValueError naming the
+    argument.
+    """
+    check_tensor("boxes", boxes, FLOATS, (None, None, 7))
+    check_tensor("valid", valid, (torch.bool,), tuple(boxes.shape[:2]), like=boxes)
+    check_tensor("counts", counts, (torch.int32,), (boxes.shape[0],), like=boxes)
+    check_tensor("iou_thresholds", iou_thresholds, (boxes.dtype,), (None,), like=boxes)
+    if len(iou_thresholds) == 0 or limit < 0:
+        raise ValueError(
+            f"iou_thresholds, limit: want one or more and 0 or more, got {len(iou_thresholds)} and {limit}"
+        )
+    return _nms_groups(boxes.detach(), valid.contiguous(), counts.contiguous(), iou_thresholds.contiguous(), limit)
 
 
 def rotated_match(anchors: Tensor, boxes: Tensor, starts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -432,14 +508,32 @@ def _suppress_serially(boxes: Tensor, iou_threshold: float, keep: Tensor) -> Non
 
 
 def _suppress_in_parallel(boxes: Tensor, iou_threshold: float, keep: Tensor) -> None:
-    """Many threads compare all pairs into a mask of bits, one thread sweeps it."""
-    dtype = WARP_FLOAT[boxes.dtype]
-    words = -(-len(boxes) // WORD)
-    mask = torch.empty(len(boxes), words, dtype=torch.int64, device=boxes.device)
-    removed = torch.zeros(words, dtype=torch.int64, device=boxes.device)
-    inputs = [array(boxes), dtype(iou_threshold), array(mask)]
-    launch(_kernels(dtype).nms_mask, (len(boxes), words), inputs, boxes.device)
-    launch(_nms_sweep, 1, [array(mask), array(removed), array(keep)], boxes.device)
+    """Many threads compare all pairs into a mask of bits, which one warp sweeps."""
+    counts = torch.full((1,), len(boxes), dtype=torch.int32, device=boxes.device)
+    threshold = torch.full((1,), iou_threshold, dtype=boxes.dtype, device=boxes.device)
+    keep.copy_(_nms_groups(boxes[None], keep[None], counts, threshold, len(boxes))[0])
+
+
+def _nms_groups_outputs(boxes: Tensor, valid: Tensor, counts: Tensor, iou_thresholds: Tensor, limit: int) -> Tensor:
+    return torch.empty_like(valid, memory_format=torch.contiguous_format)
+
+
+@torch.library.custom_op("hvnet::nms_groups", mutates_args=())
+def _nms_groups(boxes: Tensor, valid: Tensor, counts: Tensor, iou_thresholds: Tensor, limit: int) -> Tensor:
+    keep = _nms_groups_outputs(boxes, valid, counts, iou_thresholds, limit)
+    groups, count = valid.shape
+    words = -(-count // WORD)
+    mask = torch.empty(groups, count, words, dtype=torch.int64, device=boxes.device)
+    removed = torch.empty(groups, words, dtype=torch.int64, device=boxes.device)
+    inputs = [array(boxes), array(counts), array(iou_thresholds), array(mask), array(keep)]
+    launch(_kernels(WARP_FLOAT[boxes.dtype]).nms_mask, mask.shape, inputs, boxes.device)
+    lanes = 32 if boxes.device.type == "cuda" else 1
+    inputs = [array(mask), array(valid), array(counts), limit, lanes, array(removed), array(keep)]
+    launch(_nms_sweep, (groups, lanes), inputs, boxes.device)
+    return keep
+
+
+_nms_groups.register_fake(_nms_groups_outputs)
 
 
 def _match_outputs(anchors: Tensor, boxes: Tensor, starts: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -13,7 +13,6 @@ from torch import Tensor
 from hvnet.config import ClassConfig, Config, config_to_dict, load_config
 from hvnet.data.kitti import read_frame
 from hvnet.exceptions import InputError
-from hvnet.kernels import launch
 from hvnet.kernels.rotated import rotated_iou_bev
 from hvnet.network.anchors import MAX_HEIGHT, MAX_SIZE
 from hvnet.network.checkpoint import load_checkpoint, save_checkpoint
@@ -54,23 +53,6 @@ def test_the_same_boxes_as_the_plain_model(demo: Config, direction: bool, batch_
     assert sum(len(one.boxes) for one in want) > 20 * batch_size
     for one, other in zip(found, want, strict=True):
         same(one, other)
-
-
-def test_arrays_of_fixed_size_give_the_same_boxes(demo: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A GPU takes the best anchors, whatever their score, and marks those above the threshold: here on the CPU."""
-    model = lively(demo, score_threshold=0.05, candidates=100)
-    detector = Detector(model, CPU, torch.float32)
-    points = some_points()
-    want = detector(points)
-    with torch.no_grad():
-        levels, logits = detector.maps(points, torch.zeros(500, dtype=torch.int64), 1)
-        monkeypatch.setattr(launch, "force_many_threads", True)  # from here on as on a GPU
-        candidates = detector.candidates(levels, logits)
-    assert all(len(each.boxes) == 100 for each in candidates[0])
-    assert any(not each.valid.all() for each in candidates[0])
-    found = detector.suppress(candidates)[0]
-    assert len(want.boxes) > 3
-    same(found, want, 1e-6)
 
 
 def test_bfloat16_finds_the_same_objects(demo: Config) -> None:
@@ -144,17 +126,6 @@ def test_training_does_not_change_a_detector(demo: Config) -> None:
         assert torch.equal(now, then)
 
 
-def on_a_gpu(detector: Detector, points: Tensor) -> Detections:
-    """What a detector on the CPU finds by the steps that it takes on a GPU."""
-    with torch.no_grad():
-        levels, scores = detector.maps(points, torch.zeros(len(points), dtype=torch.int64), 1)
-        launch.force_many_threads = True
-        try:
-            return detector.suppress(detector.candidates(levels, scores))[0]
-        finally:
-            launch.force_many_threads = False
-
-
 @pytest.mark.parametrize("branch", ["location", "vertical"])
 @pytest.mark.parametrize("value", [1e30, -1e30, math.inf, -math.inf])
 @pytest.mark.parametrize("regression", ["corners", "pose"])
@@ -165,7 +136,7 @@ def test_boxes_of_outputs_without_bounds(demo: Config, regression: str, value: f
         torch.nn.init.constant_(getattr(head, branch).bias, value)
     points, detector = some_points(), Detector(model, CPU, torch.float32)
     plain = model.detect(points, torch.zeros(500, dtype=torch.int64), 1)[0]
-    for found in (plain, detector(points), on_a_gpu(detector, points)):
+    for found in (plain, detector(points)):
         assert set(found.labels.tolist()) == {0, 1, 2}
         assert found.boxes.isfinite().all()
         assert (found.boxes[:, 3:5] <= MAX_SIZE).all()
@@ -186,7 +157,7 @@ def test_what_is_not_a_number_is_not_reported(demo: Config, regression: str, bra
     points, sample = some_points(), torch.zeros(500, dtype=torch.int64)
     detector = Detector(model, CPU, torch.float32)
     plain = model.detect(points, sample, 1)[0]
-    for found in (plain, detector(points), on_a_gpu(detector, points)):
+    for found in (plain, detector(points)):
         assert len(found.boxes) > 5
         assert found.boxes.isfinite().all()
         assert found.scores.isfinite().all()
@@ -202,7 +173,7 @@ def test_nothing_but_nan(demo: Config, branch: str) -> None:
         torch.nn.init.constant_(getattr(head, branch).bias, math.nan)
     points, detector = some_points(), Detector(model, CPU, torch.float32)
     plain = model.detect(points, torch.zeros(500, dtype=torch.int64), 1)[0]
-    for found in (plain, detector(points), on_a_gpu(detector, points)):
+    for found in (plain, detector(points)):
         assert found.boxes.shape == (0, 7)
 
 

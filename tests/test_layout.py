@@ -117,6 +117,11 @@ def test_kernel_has_twin_and_test(name: str) -> None:
         "is_nested",
         "nested_index",
         "nms_order",
+        "ground_heights",
+        "place_points",
+        "write_keys",
+        "gather_patches",
+        "decode_candidates",
     }
     others |= {"scales_of", "voxel_means", "encode_voxels", "add_of_voxels", "project_voxels", "clear_voxels"}
     assert public - others - twins == set()

@@ -13,42 +13,37 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hvnet.kernels.launch import many_threads
+from hvnet.kernels.place import (
+    ABOVE_ORIGIN,
+    FAR,
+    FEWEST_CELLS,
+    FEWEST_POINTS,
+    GROUND_SHARE,
+    LOWEST_GROUND,
+    NEAR,
+    NEAREST,
+    PLAIN_CELLS,
+    SAMPLED,
+    TOLERANCE,
+    UNDERGROUND,
+    WINDOW,
+    ground_heights,
+)
 
 Floats = NDArray[np.float32]
 
 FULL_SCALES = (1.0, 255.0, 65535.0)
 """Largest reflectance of sensors that count up to 1, in 8 bits and in 16 bits."""
-TOLERANCE = 0.1
-"""By how much a reflectance may exceed 1."""
 OUTLIER = 20.0
 """A reflectance that is so many times the 95 % quantile says nothing about the scale."""
-FEWEST_POINTS = 10
-"""From so many points on a reflectance that is the same everywhere means nothing."""
-
 LEFT_OUT = "reflectance left out"
 
-NEAREST, NEAR, FAR = 3.0, 15.0, 50.0
-"""Metres from the sensor: the ground is looked for between the first two, and up to the third where few points are."""
 CELL = 1.0  # metres
-WINDOW = 0.6
-"""Metres of height that hold the lowest points of most cells of a street."""
-FEWEST_CELLS = 30
-GROUND_SHARE = 0.3
-"""Share of the cells whose lowest points must agree; in KITTI's frames it is 0.55 and more."""
 GROUND_TOLERANCE = 0.4
 """Metres by which the ground may differ from that of the training data before a cloud is moved; KITTI's own frames
 differ by 0.25 at most."""
-SAMPLED = 40_000
-"""Points that are looked at: more of them tell the same."""
 FEW_IN_RANGE = 0.02
 """Share of a cloud's points in range below which the reason is wanted: it is 0.5 of KITTI's whole scans."""
-LOWEST_GROUND = -100.0
-"""Metres from the sensor's origin from which on the ground is looked for, up to 1 km above."""
-ABOVE_ORIGIN = 0.5
-"""Metres from which on ground is above the sensor's origin, as with heights of a map: it has to be plainer then."""
-PLAIN_CELLS = 100
-UNDERGROUND = 0.05
-"""Share of the points that may lie below ground that is above the origin: else it is a ceiling, or treetops."""
 
 
 class Reflectance(NamedTuple):
@@ -115,11 +110,10 @@ def dropped_note(count: int) -> str:
     return f"{count} points that are not finite were dropped"
 
 
-def as_points(points: object, device: torch.device | str = "cpu") -> Tensor:
-    """Points of any array as a float32 tensor (N, 4) on a device: x, y, z in metres, reflectance in [0, 1].
+def check_points(points: object, device: torch.device | str | None = None) -> Tensor:
+    """Points of any array as a float32 tensor (N, 4), on a device or where they are.
 
-    A reflectance that is NaN, or the same everywhere, is 0: there is none. Raises ValueError for another shape, or
-    numbers that are not real.
+    Raises ValueError for another shape, or numbers that are not real.
     """
     if isinstance(points, np.ndarray):
         if points.dtype.kind not in "fiu":
@@ -134,6 +128,16 @@ def as_points(points: object, device: torch.device | str = "cpu") -> Tensor:
         transposed = tensor.ndim == 2 and (tensor.shape[0] == 4 or 3 <= tensor.shape[0] <= 16 < tensor.shape[1])
         hint = ": it is transposed, give points.T" if transposed else ""
         raise ValueError(f"points: want shape (N, 4) with x, y, z, reflectance, got {tuple(tensor.shape)}{hint}")
+    return tensor
+
+
+def as_points(points: object, device: torch.device | str = "cpu") -> Tensor:
+    """Points of any array as a float32 tensor (N, 4) on a device: x, y, z in metres, reflectance in [0, 1].
+
+    A reflectance that is NaN, or the same everywhere, is 0: there is none. Raises ValueError for another shape, or
+    numbers that are not real.
+    """
+    tensor = check_points(points, device)
     reflectance = tensor[:, 3]
     clean = reflectance.nan_to_num(0.0, math.inf, -math.inf).clamp(min=0)
     if len(tensor) >= FEWEST_POINTS:
@@ -171,13 +175,19 @@ def find_ground(points: Tensor) -> Tensor:
     """Height in metres of the ground around the sensor in a cloud (N, 3 or more): (), NaN where none is found.
 
     In every cell of 1 m the lowest twentieth of the points is skipped; the ground is where most cells agree on the next
-    one. No length depends on the data, so that nothing is read from a GPU.
+    one. On many threads it is found by `ground_heights`, which reads nothing from the device.
     """
+    if many_threads(points.device):
+        if points.shape[1] == 3:
+            points = torch.cat((points, points[:, 2:]), dim=1)  # a reflectance, which is not looked at
+        cloud = points[:, :4].float().contiguous()[None]
+        counts = torch.full((1,), len(points), dtype=torch.int32, device=points.device)
+        return ground_heights(cloud, counts)[0].to(points.dtype)
     points = points[:: max(1, len(points) // SAMPLED), :3]
     height, enough = _common_height(_low_heights(points, NEAR), points)
-    if many_threads(points.device) or not enough:
+    if not enough:
         wide, enough_wide = _common_height(_low_heights(points, FAR), points)
-        height = height.where(enough, wide.where(enough_wide, math.nan))
+        height = wide.where(enough_wide, math.nan)
     return height.to(points.dtype)
 
 
@@ -187,13 +197,12 @@ def _low_heights(points: Tensor, far: float) -> Tensor:
     distance = torch.hypot(x, y)
     # false for NaN
     ring = (distance >= NEAREST) & (distance < far) & (z > LOWEST_GROUND) & (z < LOWEST_GROUND + 1000)
-    if not many_threads(points.device):
-        x, y, z, ring = x[ring], y[ring], z[ring], ring[ring]
+    x, y, z = x[ring], y[ring], z[ring]
     side = math.ceil(2 * far / CELL)
     cell = ((x + far) / CELL).int().clamp(0, side - 1) * side + ((y + far) / CELL).int().clamp(0, side - 1)
     # cell and height, to the centimetre, in one number, which is sorted once
     levels = 2**17
-    key = torch.where(ring, cell * levels + ((z - LOWEST_GROUND) * 100).int(), side * side * levels).sort().values
+    key = (cell * levels + ((z - LOWEST_GROUND) * 100).int()).sort().values
     starts = torch.searchsorted(key, torch.arange(side * side + 1, device=points.device, dtype=torch.int32) * levels)
     counts = starts.diff()
     if not len(key):

@@ -3,6 +3,8 @@
 The pyramids that the paper compares it with have the same interface: B_1, B_2, B_3 to the levels that the heads see.
 """
 
+from typing import cast
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -27,6 +29,44 @@ def deconv_bn_relu(in_channels: int, out_channels: int, stride: int) -> nn.Seque
         BatchNorm2d(out_channels),
         nn.ReLU(inplace=True),
     )
+
+
+class ConvReLU(nn.Module):
+    """A convolution with a bias and its ReLU, in inference: on CUDA one kernel, where cuDNN has one that fits."""
+
+    def __init__(self, convolution: nn.Conv2d) -> None:
+        super().__init__()
+        self.convolution = convolution
+        self.one_kernel: bool | None = None  # not known before the first call on CUDA, which tries it
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Features (B, C, H, W) to (B, C', H', W')."""
+        if features.device.type == "cuda" and torch.backends.cudnn.is_available():
+            if self.one_kernel is None:
+                self.one_kernel = self.has_one_kernel(features)
+            if self.one_kernel:
+                return self.by_cudnn(features)
+        return F.relu_(self.convolution(features))
+
+    def by_cudnn(self, features: Tensor) -> Tensor:
+        """As forward, by cuDNN's fused kernel."""
+        layer = self.convolution
+        padding = cast(tuple[int, ...], layer.padding)  # numbers, not "same"
+        return torch.cudnn_convolution_relu(
+            features, layer.weight, layer.bias, layer.stride, padding, layer.dilation, layer.groups
+        )
+
+    def has_one_kernel(self, features: Tensor) -> bool:
+        """Whether cuDNN's fused kernel exists for this layer and gives what the two give. Reads the device."""
+        wanted = F.relu_(self.convolution(features))
+        # memory that the next output takes: cuDNN is given it as an addend too, with a weight of 0
+        torch.full_like(wanted, torch.nan)
+        try:
+            found = self.by_cudnn(features)
+        except RuntimeError:  # no engine for these shapes, or this type
+            return False
+        tolerance = 4 * torch.finfo(wanted.dtype).eps ** 0.5 if wanted.dtype == torch.float32 else 0.05
+        return bool(((found - wanted).abs().float() <= tolerance * wanted.abs().float().amax()).all())
 
 
 class Block(nn.Module):

@@ -2,9 +2,10 @@
 
 Batch norms are folded into the convolutions, the encoder is the fused one, backbone and heads run in bfloat16 where the
 device is faster with it, and only the anchors whose score is above the threshold are regressed and decoded. On a GPU
-everything up to the scores is one CUDA graph, and the boxes come to the host in one transfer.
+all of it is one CUDA graph (`network/static.py`), between one copy of the clouds and one of the boxes.
 """
 
+import contextlib
 import copy
 import math
 from collections.abc import Sequence
@@ -21,6 +22,7 @@ from hvnet.data.sensor import (
     FEW_IN_RANGE,
     Look,
     as_points,
+    check_points,
     find_ground,
     inside,
     range_reason,
@@ -30,13 +32,16 @@ from hvnet.data.sensor import (
 )
 from hvnet.exceptions import InputError
 from hvnet.kernels.launch import many_threads
+from hvnet.kernels.place import ground_heights, place_points
 from hvnet.kernels.rotated import nms_order, rotated_nms
 from hvnet.network.anchors import anchors_per_cell, decode
+from hvnet.network.backbone import ConvReLU
 from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint
 from hvnet.network.devices import select_device
 from hvnet.network.fused import inference, is_fused
 from hvnet.network.head import LOCATION_VALUES, Head, scores_of
 from hvnet.network.model import Detections, HVNet
+from hvnet.network.static import COLUMNS, BoxSteps, Rows, StaticFrame, capacity_of
 
 SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "compact.pt"
 """The weights that come with the package: see docs/model_card.md."""
@@ -59,11 +64,11 @@ class Placed(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """The anchors of a class and a sample that go into NMS; those that are not valid only fill up the array."""
+    """The anchors of a class and a sample that go into NMS, best first."""
 
     boxes: Tensor  # (K, 7)
     scores: Tensor  # (K,)
-    valid: Tensor  # (K,) bool: above the threshold, and finite
+    valid: Tensor  # (K,) bool: finite; others are not reported
 
 
 class Detector:
@@ -115,7 +120,13 @@ class Detector:
         ]
         self.regression_weights = [regression_weight(head) for head in heads]
         self.anchors = [model.anchors(label) for label in range(len(heads))]
-        self.graphs: dict[tuple[int, int], Graph] = {}  # the last few, by batch size and number of points
+        # for many threads
+        self.steps = BoxSteps(self.config.head, self.regression_weights, self.anchors)
+        self.cosines = torch.tensor([[math.cos(turn), math.sin(turn)] for turn in self.turns], device=device)
+        self.fixed_shift = torch.zeros(1, device=device)
+        if ground is not None and sensor_height not in ("found", "none"):
+            self.fixed_shift = shift_to(torch.tensor([-float(sensor_height)]), ground).to(device)
+        self.frames: dict[tuple[int, int], StaticFrame] = {}  # the last few, by batch size and number of points
 
     def __call__(self, points: Tensor | NDArray) -> Detections:
         """Points (N, 4), x, y, z in metres and reflectance in [0, 1], to boxes (M, 7), scores (M,), labels (M,).
@@ -130,6 +141,19 @@ class Detector:
         """The boxes of several clouds (N, 4), detected together. Raises ValueError for points of another shape."""
         if not clouds:
             return []
+        with torch.cuda.device(self.device) if self.device.type == "cuda" else contextlib.nullcontext():
+            found, bright, shift = (
+                self.batch_of_many(clouds) if many_threads(self.device) else self.batch_of_one(clouds)
+            )
+        results = []
+        for k, (brightest, raised) in enumerate(zip(bright, shift, strict=True)):
+            if brightest:
+                raise ValueError(reflectance_error(brightest))
+            results.append(self.take_back(found[k * len(self.turns) : (k + 1) * len(self.turns)], raised))
+        return results
+
+    def batch_of_one(self, clouds: Sequence[Tensor | NDArray]) -> tuple[list[Detections], list[float], list[float]]:
+        """What one thread finds in every direction of every cloud (N, 4), their brightest reflectances and shifts."""
         placed = [self.place(cloud) for cloud in clouds]
         parts = [part for each in placed for part in each.clouds]
         points = torch.cat(parts)
@@ -137,13 +161,42 @@ class Detector:
         sample = torch.repeat_interleave(torch.arange(len(parts)), lengths).to(self.device)
         levels, scores = self.maps(points, sample, len(parts))
         found = self.suppress(self.candidates(levels, scores))
-        facts = torch.stack([torch.stack((each.bright, each.shift)) for each in placed]).tolist()
-        results = []
-        for k, (bright, shift) in enumerate(facts):
-            if bright:
-                raise ValueError(reflectance_error(bright))
-            results.append(self.take_back(found[k * len(self.turns) : (k + 1) * len(self.turns)], shift))
-        return results
+        return found, [float(each.bright) for each in placed], [float(each.shift) for each in placed]
+
+    def batch_of_many(self, clouds: Sequence[Tensor | NDArray]) -> tuple[list[Detections], list[float], list[float]]:
+        """The same by many threads."""
+        checked = [check_points(cloud) for cloud in clouds]
+        key = len(checked), capacity_of(checked)
+        if key not in self.frames:
+            while len(self.frames) >= MAX_GRAPHS:
+                del self.frames[next(iter(self.frames))]
+            frame = StaticFrame(*key, len(self.turns), self.device)
+            if self.device.type == "cuda" and self.is_fused(len(checked) * len(self.turns)):
+                frame.capture(self.numbers)
+            self.frames[key] = frame
+        output = self.frames[key](checked, self.numbers)
+        bright, shift = output[-2 * len(checked) :].view(2, -1).tolist()
+        size = (len(checked) * len(self.turns), len(self.classes), self.steps.kept, COLUMNS)
+        return detections(output[: math.prod(size)].view(size)), bright, shift
+
+    def numbers(self, points: Tensor, counts: Tensor, sample: Tensor) -> Tensor:
+        """By many threads all that is found in clouds (B, N, 4) of counts (B,) int32, in one row: the table of
+        `BoxSteps.suppress`, and for every cloud its brightest reflectance and its shift.
+
+        sample: the direction of a cloud (B T N,) int64 that each point is turned to.
+        """
+        shift = self.shifts(points, counts)
+        point_range = self.config.encoder.point_range
+        placed, bright = place_points(points, counts, shift, self.cosines, point_range, self.reflectance)
+        levels = self.backbone(self.encode(placed.view(-1, 4), sample, len(points) * len(self.turns)))
+        table = self.steps.suppress(self.steps.candidates(levels, self.steps.keys(self.score_maps(levels))))
+        return torch.cat((table.flatten(), bright, shift))
+
+    def shifts(self, points: Tensor, counts: Tensor) -> Tensor:
+        """By many threads the metres (B,) by which clouds (B, N, 4) of counts (B,) int32 are raised."""
+        if self.ground is not None and self.sensor_height == "found":
+            return shift_to(ground_heights(points, counts), self.ground)
+        return self.fixed_shift.expand(len(points)).contiguous()
 
     def place(self, cloud: Tensor | NDArray) -> Placed:
         """Moves a cloud (N, 4) to where the network expects its road, and turns it."""
@@ -209,22 +262,9 @@ class Detector:
             rows.append(own[kept[: self.config.head.detections]])
         return joined.select(torch.cat(rows))
 
-    def maps(self, points: Tensor, sample: Tensor, batch_size: int) -> tuple[list[Tensor], list[Tensor]]:
-        """Pyramid levels (B, C, N_L, N_W) / 2^k and the scores (B, A) of every class; on a GPU by a CUDA graph.
-
-        They hold until the next call.
-        """
-        if self.device.type != "cuda" or not self.is_fused(batch_size):
-            return self.score(self.backbone(self.encode(points, sample, batch_size)))
-        # the graph is for a number of points: the next power of two, filled up with points that are outside
-        capacity = 1 << max(len(points) - 1, 1023).bit_length()
-        key = (batch_size, capacity)
-        with torch.cuda.device(self.device):
-            if key not in self.graphs:
-                while len(self.graphs) >= MAX_GRAPHS:
-                    del self.graphs[next(iter(self.graphs))]
-                self.graphs[key] = Graph(self, batch_size, capacity)
-            return self.graphs[key](points, sample)
+    def maps(self, points: Tensor, sample: Tensor, batch_size: int) -> tuple[list[Tensor], list[Tensor] | Tensor]:
+        """Pyramid levels (B, C, N_L, N_W) / 2^k and the scores of every class; they hold until the next call."""
+        return self.score(self.backbone(self.encode(points, sample, batch_size)))
 
     def encode(self, points: Tensor, sample: Tensor, batch_size: int) -> list[Tensor]:
         """Pseudo-images, finest first, that hold until the next call."""
@@ -234,17 +274,28 @@ class Detector:
         """Whether the encoder runs as `FusedEncoder` for batches of this size."""
         return is_fused(self.encoder, batch_size)
 
-    def score(self, levels: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        """The pyramid levels, and the scores (B, A) float32 of every class."""
+    def score_maps(self, levels: list[Tensor]) -> list[list[Tensor]]:
+        """The logits (B, N_anc, N_L, N_W) of every class: of its score and, if it is predicted, of its IoU."""
+        return [
+            [layer(levels[entry.level]) for layer in layers]
+            for layers, entry in zip(self.score_layers, self.entries, strict=True)
+        ]
+
+    def score(self, levels: list[Tensor]) -> tuple[list[Tensor], list[Tensor] | Tensor]:
+        """The pyramid levels, and the scores (B, A) float32 of every class; by many threads their keys."""
+        if many_threads(self.device):
+            return levels, self.steps.keys(self.score_maps(levels))
         scores = []
-        for layers, entry in zip(self.score_layers, self.entries, strict=True):
-            maps = [layer(levels[entry.level]).permute(0, 2, 3, 1) for layer in layers]
-            logits, *iou = [each.reshape(len(each), -1).float() for each in maps]
+        for maps in self.score_maps(levels):
+            rows = [each.permute(0, 2, 3, 1) for each in maps]
+            logits, *iou = [each.reshape(len(each), -1).float() for each in rows]
             scores.append(scores_of(logits, iou[0] if iou else None))
         return levels, scores
 
-    def candidates(self, levels: list[Tensor], scores: list[Tensor]) -> list[list[Candidates]]:
+    def candidates(self, levels: list[Tensor], scores: list[Tensor] | Tensor) -> list[list[Candidates]] | Rows:
         """For every sample and class the best anchors above the threshold, regressed and decoded."""
+        if isinstance(scores, Tensor):
+            return self.steps.candidates(levels, scores)
         return [
             [self._candidates(label, b, levels, of_class[b]) for label, of_class in enumerate(scores)]
             for b in range(len(scores[0]))
@@ -252,66 +303,38 @@ class Detector:
 
     def _candidates(self, label: int, b: int, levels: list[Tensor], scores: Tensor) -> Candidates:
         head, entry = self.config.head, self.entries[label]
-        if not many_threads(self.device):
-            at = (scores > head.score_threshold).nonzero().squeeze(1)
-            at = at[torch.sort(scores[at], descending=True, stable=True).indices[: head.candidates]]
-        else:  # as many for every cloud, so that no length is read from the device
-            ranked = scores.nan_to_num(nan=-1.0)  # a NaN would come first
-            at = torch.sort(ranked, descending=True, stable=True).indices[: head.candidates]
+        at = (scores > head.score_threshold).nonzero().squeeze(1)
+        at = at[torch.sort(scores[at], descending=True, stable=True).indices[: head.candidates]]
         scores = scores[at]
         values = regress(levels[entry.level][b], at, self.regression_weights[label], anchors_per_cell(entry))
         count = LOCATION_VALUES[head.regression]
         direction = values[:, count + 2 :].argmax(dim=1) if head.direction else None
         boxes = decode(values[:, :count], values[:, count : count + 2], direction, self.anchors[label][at])
-        return Candidates(boxes, scores, (scores > head.score_threshold) & boxes.isfinite().all(dim=1))
+        return Candidates(boxes, scores, boxes.isfinite().all(dim=1))
 
-    def suppress(self, candidates: list[list[Candidates]]) -> list[Detections]:
-        """Rotated NMS class by class, and the one transfer to the host."""
-        head = self.config.head
-        parts, lengths = [], []
+    def suppress(self, candidates: list[list[Candidates]] | Rows) -> list[Detections]:
+        """Rotated NMS class by class: the boxes of every sample, on the host."""
+        if isinstance(candidates, Rows):
+            return detections(self.steps.suppress(candidates).cpu())
+        head, samples = self.config.head, []
         for of_sample in candidates:
+            parts = []
             for label, (boxes, scores, valid) in enumerate(of_sample):
                 scores = scores.where(valid, -1.0)  # after all others
                 order, keep = nms_order(boxes, scores, self.entries[label].nms_iou)
-                keep = keep & valid[order]
-                keep = keep & (keep.cumsum(0) <= head.detections)
-                columns = (scores[order], torch.full_like(scores, label), keep.float())
-                parts.append(torch.cat((boxes[order], torch.stack(columns, dim=1)), dim=1))
-                lengths.append(len(order))
-        found = torch.cat(parts).cpu().split(lengths)
-        classes = len(self.classes)
-        samples = [torch.cat(found[k : k + classes]) for k in range(0, len(found), classes)]
-        kept = [rows[rows[:, 9] > 0] for rows in samples]
-        return [Detections(rows[:, :7], rows[:, 7], rows[:, 8].long()) for rows in kept]
+                kept = order[keep & valid[order]][: head.detections]
+                parts.append(Detections(boxes[kept], scores[kept], torch.full_like(kept, label)))
+            samples.append(Detections(*(torch.cat(column) for column in zip(*parts, strict=True))))
+        return samples
 
 
-class Graph:
-    """The CUDA graph of encoder, backbone and scores for a batch of one size, and at most `capacity` points (N, 4)."""
-
-    def __init__(self, detector: Detector, batch_size: int, capacity: int) -> None:
-        self.points = torch.full((capacity, 4), torch.nan, device=detector.device)  # not finite, hence outside
-        self.sample = torch.zeros(capacity, dtype=torch.int64, device=detector.device)
-
-        def run() -> tuple[list[Tensor], list[Tensor]]:
-            return detector.score(detector.backbone(detector.encode(self.points, self.sample, batch_size)))
-
-        side = torch.cuda.Stream(detector.device)
-        side.wait_stream(torch.cuda.current_stream(detector.device))
-        with torch.cuda.stream(side):
-            for _ in range(2):  # kernels are compiled and buffers made before the capture
-                run()
-        torch.cuda.current_stream(detector.device).wait_stream(side)
-        self.graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self.graph, stream=side, capture_error_mode="thread_local"):
-            self.outputs = run()
-
-    def __call__(self, points: Tensor, sample: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-        """What `Detector.maps` returns, for at most as many points as the graph has room for."""
-        self.points[: len(points)] = points
-        self.points[len(points) :] = torch.nan
-        self.sample[: len(sample)] = sample
-        self.graph.replay()
-        return self.outputs
+def detections(table: Tensor) -> list[Detections]:
+    """The boxes that were kept in the table of `BoxSteps.suppress`, of every sample."""
+    found = []
+    for rows in table.flatten(1, 2):
+        kept = rows[rows[:, 9] > 0]
+        found.append(Detections(kept[:, :7], kept[:, 7], kept[:, 8].long()))
+    return found
 
 
 def fastest_dtype(device: torch.device) -> torch.dtype:
@@ -322,7 +345,7 @@ def fastest_dtype(device: torch.device) -> torch.dtype:
 
 
 def fold_batch_norms(module: nn.Module) -> nn.Module:
-    """A copy in which each convolution followed by a batch norm is one convolution."""
+    """A copy in which each convolution followed by a batch norm is one convolution, and one layer with a ReLU."""
     if isinstance(module, nn.Sequential):
         layers: list[nn.Module] = []
         for layer in module:
@@ -331,6 +354,8 @@ def fold_batch_norms(module: nn.Module) -> nn.Module:
                 assert isinstance(convolution, nn.Conv2d | nn.ConvTranspose2d)
                 transposed = isinstance(convolution, nn.ConvTranspose2d)
                 layers.append(fuse_conv_bn_eval(convolution, layer, transposed))
+            elif isinstance(layer, nn.ReLU) and layers and isinstance(layers[-1], nn.Conv2d):
+                layers[-1] = ConvReLU(layers[-1])
             else:
                 layers.append(fold_batch_norms(layer))
         return nn.Sequential(*layers)
