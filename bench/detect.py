@@ -1,7 +1,7 @@
 """From a file to boxes, stage by stage: the detector that `hvnet.load` gives, against the plain model, in one run.
 
-On a GPU the stages are timed one by one, but "detector" runs those up to the heads as one CUDA graph: it takes less
-than their sum.
+On a GPU the stages are timed one by one, but "detector" runs all of them, placing included, as one CUDA graph between
+two copies: it takes less than their sum.
 
 Frames are read and judged (reflectance, ground), encoded, sent through the backbone, scored, decoded and suppressed,
 warm and synchronised, in turns with the plain model: float32, batch norms as they are, every anchor regressed. Before a

@@ -26,7 +26,7 @@ PI = 3.14159265358979
 class AnchorTable(NamedTuple):
     """The anchors of C classes in one array, and what their boxes are decoded by."""
 
-    boxes: Tensor  # (A, 7) float32
+    boxes: Tensor  # (A, 9) float32: box (7), cosine and sine of its yaw
     starts: Tensor  # (C,) int32, the first of every class
     per_cell: Tensor  # (C,) int32, anchors at a cell of the class's map
     values: int  # that are regressed for an anchor: location, vertical and, if there is one, direction
@@ -215,8 +215,8 @@ def _decode(
         yaw = anchors[a, 6] + _bounded(values[label, row, v + 4], -most, most)
         next = v + 5
     else:
-        cos = wp.cos(anchors[a, 6])
-        sin = wp.sin(anchors[a, 6])
+        cos = anchors[a, 7]
+        sin = anchors[a, 8]
         along = wp.vec2(0.5 * length * cos, 0.5 * length * sin)
         across = wp.vec2(-(0.5 * width * sin), 0.5 * width * cos)
         centre = wp.vec2(anchors[a, 0], anchors[a, 1])

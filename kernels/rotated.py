@@ -309,10 +309,10 @@ def nms_groups(boxes: Tensor, valid: Tensor, counts: Tensor, iou_thresholds: Ten
     check_tensor("valid", valid, (torch.bool,), tuple(boxes.shape[:2]), like=boxes)
     check_tensor("counts", counts, (torch.int32,), (boxes.shape[0],), like=boxes)
     check_tensor("iou_thresholds", iou_thresholds, (boxes.dtype,), (None,), like=boxes)
-    if len(iou_thresholds) == 0 or limit < 0:
-        raise ValueError(
-            f"iou_thresholds, limit: want one or more and 0 or more, got {len(iou_thresholds)} and {limit}"
-        )
+    if len(iou_thresholds) == 0:
+        raise ValueError("iou_thresholds: want one or more, got none")
+    if limit < 0:
+        raise ValueError(f"limit: want 0 or more, got {limit}")
     return _nms_groups(boxes.detach(), valid.contiguous(), counts.contiguous(), iou_thresholds.contiguous(), limit)
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from hvnet.config import BackboneConfig
-from hvnet.network.backbone import FPN, Backbone
+from hvnet.network.backbone import FPN, Backbone, ConvReLU
 
 
 @pytest.mark.parametrize(("pyramid", "levels"), [("none", 3), ("fpn", 3), ("ffpn", 3), ("upsampled", 1)])
@@ -26,3 +26,31 @@ def test_fpn_adds_the_coarser_levels() -> None:
     fpn.smooth = torch.nn.ModuleList(torch.nn.Identity() for _ in range(3))
     levels = fpn([torch.ones(1, 1, 8, 4), torch.ones(1, 1, 4, 2), torch.ones(1, 1, 2, 1)])
     assert [level.unique().tolist() for level in levels] == [[3], [2], [1]]
+
+
+def test_one_kernel_is_taken_where_it_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not where cuDNN has none, as on the CPU, nor where it reads what was in the output's memory before."""
+    layer = ConvReLU(torch.nn.Conv2d(3, 4, 3, padding=1))
+    features = torch.randn(1, 3, 6, 5, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        want = layer.convolution(features).relu()
+        assert torch.equal(layer(features), want)
+        assert not layer.has_one_kernel(features)
+        for factor, taken in ((1.0, True), (1.01, False), (torch.nan, False)):
+            monkeypatch.setattr(layer, "by_cudnn", lambda x, factor=factor: layer.convolution(x).relu() * factor)
+            assert layer.has_one_kernel(features) == taken
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.bfloat16])
+@pytest.mark.parametrize(("kernel", "stride"), [(3, 1), (3, 2), (1, 1)])
+def test_one_kernel_on_cuda(kernel: int, stride: int, dtype: torch.dtype) -> None:
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    torch.manual_seed(0)
+    layer = ConvReLU(torch.nn.Conv2d(64, 128, kernel, stride, padding=kernel // 2)).to("cuda", dtype)
+    features = torch.randn(1, 64, 40, 56, device="cuda", dtype=dtype).to(memory_format=torch.channels_last)
+    with torch.no_grad():
+        want = torch.relu(layer.convolution(features))
+        torch.testing.assert_close(layer(features), want, rtol=0.02, atol=0.02)
+        assert list(layer.one_kernel) == [features.shape]

@@ -4,21 +4,27 @@ import copy
 import dataclasses
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch._library.custom_ops import OPDEFS
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from hvnet.config import ClassConfig, Config, config_to_dict, load_config
 from hvnet.data.kitti import read_frame
 from hvnet.exceptions import InputError
+from hvnet.kernels import launch
 from hvnet.kernels.rotated import rotated_iou_bev
 from hvnet.network.anchors import MAX_HEIGHT, MAX_SIZE
-from hvnet.network.checkpoint import load_checkpoint, save_checkpoint
+from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint, save_checkpoint
 from hvnet.network.detector import (
+    MAX_GRAPHS,
     SHIPPED,
     Detector,
+    detections,
     fold_batch_norms,
     load,
     regress,
@@ -31,6 +37,7 @@ from hvnet.network.model import Detections, HVNet
 from tests.models import CONFIGS, NARROW, lively, some_points
 
 CPU = torch.device("cpu")
+both_ways = pytest.mark.usefixtures("threads")
 
 
 def same(found: Detections, want: Detections, tolerance: float = 1e-4) -> None:
@@ -42,6 +49,7 @@ def same(found: Detections, want: Detections, tolerance: float = 1e-4) -> None:
     assert (turn.cos() > 0.9).all()
 
 
+@both_ways
 @pytest.mark.parametrize("direction", [True, False])
 @pytest.mark.parametrize("batch_size", [1, 3])
 def test_the_same_boxes_as_the_plain_model(demo: Config, direction: bool, batch_size: int) -> None:
@@ -93,6 +101,7 @@ def test_regression_of_chosen_anchors_equals_the_convolutions(demo: Config) -> N
     torch.testing.assert_close(found, want[at], rtol=1e-5, atol=1e-5)
 
 
+@both_ways
 @pytest.mark.parametrize(
     "changes",
     [
@@ -115,6 +124,7 @@ def test_every_switch_detects_as_the_plain_model(changes: dict[str, str]) -> Non
     same(found, want)
 
 
+@both_ways
 def test_training_does_not_change_a_detector(demo: Config) -> None:
     model = lively(demo, score_threshold=0.05)
     detector = Detector(model, CPU)
@@ -126,6 +136,7 @@ def test_training_does_not_change_a_detector(demo: Config) -> None:
         assert torch.equal(now, then)
 
 
+@both_ways
 @pytest.mark.parametrize("branch", ["location", "vertical"])
 @pytest.mark.parametrize("value", [1e30, -1e30, math.inf, -math.inf])
 @pytest.mark.parametrize("regression", ["corners", "pose"])
@@ -143,6 +154,7 @@ def test_boxes_of_outputs_without_bounds(demo: Config, regression: str, value: f
         assert (found.boxes[:, 5] <= MAX_HEIGHT).all()
 
 
+@both_ways
 @pytest.mark.parametrize("branch", ["score", "location", "vertical"])
 @pytest.mark.parametrize("regression", ["corners", "pose"])
 def test_what_is_not_a_number_is_not_reported(demo: Config, regression: str, branch: str) -> None:
@@ -166,6 +178,7 @@ def test_what_is_not_a_number_is_not_reported(demo: Config, regression: str, bra
         same(plain, without.detect(points, sample, 1)[0])
 
 
+@both_ways
 @pytest.mark.parametrize("branch", ["score", "location", "vertical"])
 def test_nothing_but_nan(demo: Config, branch: str) -> None:
     model = lively(demo, score_threshold=0.02)
@@ -175,6 +188,145 @@ def test_nothing_but_nan(demo: Config, branch: str) -> None:
     plain = model.detect(points, torch.zeros(500, dtype=torch.int64), 1)[0]
     for found in (plain, detector(points)):
         assert found.boxes.shape == (0, 7)
+
+
+# --- many threads ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def many_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launch, "force_many_threads", True)
+
+
+def both(detector: Detector, clouds: list[Tensor], monkeypatch: pytest.MonkeyPatch) -> list[list[Detections]]:
+    """What a detector finds with one thread, and with many."""
+    found = []
+    for many in (False, True):
+        monkeypatch.setattr(launch, "force_many_threads", many)
+        found.append(detector.batch(clouds))
+    return found
+
+
+@pytest.mark.parametrize("candidates", [1, 7, 100, 10**6])
+def test_equal_scores_at_the_border_of_the_candidates(
+    demo: Config, candidates: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The lower anchors are taken: all scores are one of two values."""
+    model = lively(demo, candidates=candidates, detections=10**6, score_threshold=0.2)
+    for head in model.heads:
+        torch.nn.init.zeros_(head.score.weight)
+        torch.nn.init.constant_(head.score.bias, 0.0)
+        torch.nn.init.constant_(head.score.bias[1:2], 1.0)
+    (one,), (many,) = both(Detector(model, CPU, torch.float32), [some_points()], monkeypatch)
+    assert len(one.boxes) >= 3
+    same(many, one)
+
+
+def test_no_score_above_the_threshold(demo: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = lively(demo, score_threshold=0.999999)
+    for found in both(Detector(model, CPU, torch.float32), [some_points(), some_points(7)], monkeypatch):
+        assert [each.boxes.shape for each in found] == [(0, 7)] * 2
+
+
+def test_no_more_than_the_detections_are_reported(demo: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = lively(demo, score_threshold=0.0, candidates=300, detections=4)
+    one, many = both(Detector(model, CPU, torch.float32), [some_points(), some_points(900, 3)], monkeypatch)
+    for found, want in zip(many, one, strict=True):
+        same(found, want)
+        assert found.labels.bincount().tolist() == [4, 4, 4]
+
+
+@pytest.mark.usefixtures("many_threads")
+def test_the_capacity_changes_no_bit(demo: Config) -> None:
+    """In the smallest frame, in one that a larger cloud has been in, and in the frame of larger clouds."""
+    detector = Detector(lively(demo, score_threshold=0.02), CPU, torch.float32)
+    points = some_points(700)
+    alone = detector(points)
+    assert len(alone.boxes) > 5
+    large = detector(some_points(8000, 5))
+    assert not torch.equal(large.boxes, alone.boxes)
+    detector.frames[1, 1024] = detector.frames.pop((1, 8192))
+    for now, then in zip(detector(points), alone, strict=True):
+        assert torch.equal(now, then)
+
+
+@both_ways
+def test_clouds_of_different_lengths_together(demo: Config) -> None:
+    detector = Detector(lively(demo, score_threshold=0.02), CPU, torch.float32)
+    clouds = [some_points(500), torch.zeros(0, 4), some_points(1300, 1), some_points(1, 2)]
+    for found, cloud in zip(detector.batch(clouds), clouds, strict=True):
+        same(found, detector(cloud))
+
+
+@pytest.mark.usefixtures("many_threads")
+def test_the_last_frames_are_kept(demo: Config) -> None:
+    """No more than MAX_GRAPHS of them, the latest; each still gives what it gave."""
+    detector = Detector(lively(demo, score_threshold=0.02), CPU, torch.float32)
+    first = detector(some_points())
+    for exponent in range(11, 11 + MAX_GRAPHS):
+        detector(some_points(2**exponent))
+    assert [capacity for _, capacity in detector.frames] == [2**exponent for exponent in range(11, 11 + MAX_GRAPHS)]
+    same(detector(some_points()), first, 1e-6)
+    assert len(detector.frames) == MAX_GRAPHS
+
+
+@pytest.mark.usefixtures("many_threads")
+def test_pillars_detect_with_many_threads(pillars: Path, street: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An encoder that is not fused, and reads the device."""
+    model = model_from_checkpoint(load_checkpoint(pillars), "pillars")
+    head = dataclasses.replace(model.config.head, score_threshold=0.0, candidates=50)
+    model.config = dataclasses.replace(model.config, head=head)
+    (one,), (many,) = both(Detector(model, CPU, torch.float32), [street[:5000]], monkeypatch)
+    assert len(one.boxes) > 20
+    same(many, one)
+
+
+READS = {
+    "_local_scalar_dense", "nonzero", "masked_select", "is_nonzero", "equal", "_unique2", "unique_consecutive",
+    "bincount", "repeat_interleave", "lift_fresh",
+}  # fmt: skip
+"""Ops that wait for the device, whose size depends on the data, or that bring a constant of the host to the device."""
+
+
+class NoReads(TorchDispatchMode):
+    """Fails on an op that a CUDA graph cannot hold; looks into the project's own ops too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: set[str] = set()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        space, name = func._schema.name.split("::")
+        self.seen.add(name)
+        if space == "hvnet":
+            with self:
+                return OPDEFS[func._schema.name]._init_fn(*args, **(kwargs or {}))
+        assert name not in READS, name
+        if name.startswith("index"):
+            assert all(index is None or index.dtype != torch.bool for index in args[1]), "a mask"
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.usefixtures("many_threads")
+@pytest.mark.parametrize("height", ["found", 1.5, "none"])
+@pytest.mark.parametrize("changes", [{}, {"head.iou": "true", "head.direction": "true", "head.regression": "pose"}])
+def test_a_frame_reads_nothing_from_the_device(changes: dict[str, str], height: Any) -> None:
+    config = load_config(CONFIGS / "demo.yaml", [*NARROW, *(f"{key}={value}" for key, value in changes.items())])
+    detector = Detector(lively(config, score_threshold=0.02), CPU, ground=-1.7, sensor_height=height, all_round=True)
+    clouds = [some_points(), some_points(900, 1)]
+    want = detector.batch(clouds)
+    frame = next(iter(detector.frames.values()))
+    mode = NoReads()
+    with torch.no_grad(), mode:
+        row = detector.numbers(*frame.split(frame.buffer), frame.sample)
+    assert {"topk", "nms_groups", "baddbmm"} <= mode.seen
+    table = row[: -2 * len(clouds)].view(2 * len(detector.turns), 3, -1, 10)
+    assert len(want[0].boxes) > 0
+    assert sum(len(each.boxes) for each in detections(table)) >= sum(len(each.boxes) for each in want)
+    with pytest.raises(AssertionError, match="a mask"), mode:
+        row[row > 0]
+    with pytest.raises(AssertionError, match="_local_scalar_dense"), mode:
+        float(row[0])
 
 
 @pytest.mark.cuda
@@ -187,6 +339,7 @@ def test_the_graph_gives_the_same_boxes(demo: Config, device: torch.device) -> N
         same(detector(some_points(count, count)), plain(some_points(count, count)), 1e-3)
 
 
+@both_ways
 @pytest.mark.parametrize("points", [torch.zeros(0, 4), torch.tensor([[5.0, 0, -1, 0]]), torch.full((3, 4), math.nan)])
 def test_detector_takes_any_cloud(demo: Config, points: Tensor) -> None:
     found = Detector(HVNet(demo), torch.device("cpu"))(points)
@@ -194,11 +347,13 @@ def test_detector_takes_any_cloud(demo: Config, points: Tensor) -> None:
     assert len(found.boxes) == len(found.scores) == len(found.labels)
 
 
+@both_ways
 def test_detector_refuses_other_shapes(demo: Config) -> None:
     with pytest.raises(ValueError, match=r"points: want shape \(N, 4\).*got \(5, 3\)"):
         Detector(HVNet(demo), torch.device("cpu"))(torch.zeros(5, 3))
 
 
+@both_ways
 def test_papers_configuration_on_a_real_frame(kitti_root: Path) -> None:
     torch.manual_seed(0)
     config = load_config(CONFIGS / "hvnet.yaml")
@@ -210,6 +365,7 @@ def test_papers_configuration_on_a_real_frame(kitti_root: Path) -> None:
     assert ((found.scores > 0) & (found.scores < 1)).all()
 
 
+@both_ways
 def test_checkpoint_gives_the_same_boxes(demo: Config, tmp_path: Path) -> None:
     torch.manual_seed(0)
     model = HVNet(demo).eval()
@@ -268,6 +424,7 @@ def agree(found: Detections, want: Detections) -> None:
     assert (turn > 0).float().mean() > 0.9  # a heading that is nearly a tie may be the other one
 
 
+@both_ways
 @pytest.mark.parametrize("height", [-5.0, 1.33, 4.0, 60.0])
 def test_a_cloud_at_another_height_is_moved_and_its_boxes_are_moved_back(street: Tensor, height: float) -> None:
     moved = street + torch.tensor([0, 0, height, 0])
@@ -280,6 +437,7 @@ def test_a_cloud_at_another_height_is_moved_and_its_boxes_are_moved_back(street:
     assert len(left.select(left.scores > 0.3).boxes) < len(want.select(want.scores > 0.3).boxes) / 2
 
 
+@both_ways
 def test_a_cloud_at_the_usual_height_is_left_alone(street: Tensor) -> None:
     want = load(device="cpu", sensor_height="none")(street)
     for found in (load(device="cpu")(street), load(device="cpu", sensor_height=1.73)(street)):
@@ -292,6 +450,7 @@ def test_a_cloud_at_the_usual_height_is_left_alone(street: Tensor) -> None:
     assert detector.look(street + torch.tensor([0, 0, 1.33, 0])).shift == pytest.approx(-1.33, abs=0.1)
 
 
+@both_ways
 @pytest.mark.parametrize("degrees", [-90.0, 37.0, 180.0])
 def test_a_turned_cloud(street: Tensor, degrees: float) -> None:
     """A sensor whose forward is elsewhere: `turn` brings it to x."""
@@ -302,6 +461,7 @@ def test_a_turned_cloud(street: Tensor, degrees: float) -> None:
     agree(load(device="cpu", turn=degrees)(mounted), want._replace(boxes=boxes))
 
 
+@both_ways
 def test_all_round(street: Tensor) -> None:
     """What is behind is found as well as what is in front, each object once, the best of a class first."""
     both = torch.cat((street, turned(street, math.pi)))
@@ -323,6 +483,7 @@ def test_all_round(street: Tensor) -> None:
     assert detector.look(both).in_range > 1.8 * load(device="cpu").look(both).in_range
 
 
+@both_ways
 def test_clouds_at_different_heights_together(street: Tensor) -> None:
     """As if each were alone."""
     clouds = [street, street + torch.tensor([0, 0, 1.33, 0]), turned(street, math.pi)]
@@ -351,6 +512,7 @@ def test_a_range_beside_the_sensor_cannot_look_all_round() -> None:
         turns_all_round((0, 1, -3, 64, 32, 2))
 
 
+@both_ways
 def test_a_model_trained_without_reflectance_gets_none(demo: Config) -> None:
     model = lively(demo, score_threshold=0.02)
     points = some_points(400)
@@ -361,12 +523,14 @@ def test_a_model_trained_without_reflectance_gets_none(demo: Config) -> None:
     )
 
 
+@both_ways
 def test_without_the_ground_of_the_training_data_nothing_is_moved(demo: Config, street: Tensor) -> None:
     """A checkpoint of an earlier version does not know it."""
     detector = Detector(lively(demo), CPU)
     assert detector.look(street + torch.tensor([0, 0, 1.33, 0])).shift == 0
 
 
+@both_ways
 def test_points_of_any_array(demo: Config) -> None:
     detector = Detector(lively(demo, score_threshold=0.02), CPU, torch.float32)
     points = some_points(400)

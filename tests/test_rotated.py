@@ -255,6 +255,50 @@ def test_nms_of_one_thread_and_of_many(count: int, dtype: torch.dtype, device: t
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("limit", [0, 7, 200])
+@pytest.mark.parametrize("thresholds", [(0.1,), (0.02, 0.4, 0.7)])
+def test_nms_of_groups_equals_twin(
+    thresholds: tuple[float, ...], limit: int, dtype: torch.dtype, device: torch.device
+) -> None:
+    """Groups without a box, with a few, with one word and one more, and full ones; each has its own threshold."""
+    counts = torch.tensor([0, 1, 64, 65, 130, 130], dtype=torch.int32)
+    boxes = random_boxes(6 * 130, 31, spread=9).to(dtype).view(6, 130, 7)
+    valid = torch.rand(6, 130, generator=torch.Generator().manual_seed(0)) > 0.1
+    boxes[2, ~valid[2]] = torch.nan
+    for group, threshold in zip(boxes, thresholds * 6, strict=False):  # no pair that rounding decides
+        iou = reference.rotated_iou_bev(*[group.double().nan_to_num(0.0)] * 2)
+        assert not ((iou - threshold).abs() < 1e-5).any()
+    for b in range(6):  # what only fills up the array would change the result, were it looked at
+        boxes[b, counts[b] :] = boxes[b, 0].nan_to_num(1.0)
+    given = boxes, valid, counts, torch.tensor(thresholds, dtype=dtype)
+    kept = rotated.nms_groups(*(each.to(device) for each in given), limit)
+    assert torch.equal(kept.cpu(), reference.nms_groups(*given, limit))
+    assert kept.sum(dim=1).tolist()[:2] == [0, int(valid[1, 0]) * min(limit, 1)]
+    assert kept.sum(dim=1).max() <= limit
+    if limit == 200:
+        assert 10 < kept[5].sum() < 120
+    wide = torch.zeros(6, 130, 10, dtype=dtype)
+    wide[..., :7] = boxes  # a part of wider rows
+    assert torch.equal(kept, rotated.nms_groups(wide.to(device)[..., :7], *(g.to(device) for g in given[1:]), limit))
+
+
+def test_bad_groups() -> None:
+    boxes, valid, counts = torch.ones(2, 3, 7), torch.ones(2, 3, dtype=torch.bool), torch.ones(2, dtype=torch.int32)
+    for change, error, said in (
+        ({"boxes": boxes[0]}, ValueError, r"boxes: want shape \(any, any, 7\)"),
+        ({"valid": valid[:1]}, ValueError, r"valid: want shape \(2, 3\)"),
+        ({"valid": counts}, TypeError, "valid: want dtype"),
+        ({"counts": counts.long()}, TypeError, "counts: want dtype"),
+        ({"iou_thresholds": torch.ones(2).double()}, TypeError, "iou_thresholds: want dtype"),
+        ({"iou_thresholds": torch.ones(0)}, ValueError, "iou_thresholds: want one or more"),
+        ({"limit": -1}, ValueError, "limit: want 0 or more"),
+    ):
+        given = {"boxes": boxes, "valid": valid, "counts": counts, "iou_thresholds": torch.ones(2), "limit": 9}
+        with pytest.raises(error, match=said):
+            rotated.nms_groups(**(given | change))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
 def test_nms_by_hand(dtype: torch.dtype, device: torch.device) -> None:
     def kept(boxes: list[Tensor], scores: list[float], threshold: float) -> list[int]:
         given = torch.cat(boxes).to(device, dtype), torch.tensor(scores, dtype=dtype, device=device)
@@ -657,10 +701,18 @@ def test_no_gradients(device: torch.device) -> None:
         rotated.rotated_overlap_pairs(boxes, boxes),
         rotated.rotated_nms(boxes, scores, 0.1),
         *rotated.nms_order(boxes, scores, 0.1),
+        rotated.nms_groups(boxes[None], *groups_of(1, 6, boxes.dtype, device)),
         *rotated.rotated_match(boxes, boxes, starts),
         rotated.box_iou_rotated(boxes[:, :5].abs(), boxes[:, :5].abs()),
     ]
     assert not any(result.requires_grad for result in results)
+
+
+def groups_of(groups: int, count: int, dtype: torch.dtype, device: torch.device | str = "cpu") -> tuple[Any, ...]:
+    """What `nms_groups` takes besides the boxes (groups, count, 7)."""
+    valid = torch.ones(groups, count, dtype=torch.bool, device=device)
+    counts = torch.arange(groups, dtype=torch.int32, device=device).add(1).clamp(max=count)
+    return valid, counts, torch.full((1,), 0.2, dtype=dtype, device=device), 2
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -676,6 +728,7 @@ def test_opcheck(dtype: torch.dtype, device: torch.device) -> None:
         (ops.nms_order, (a, scores, 0.3)),
         (ops.rotated_nms, (a, scores, None, 0.3)),
         (ops.rotated_nms, (a, scores, group, 0.3)),
+        (ops.nms_groups, (a.view(2, 3, 7), *groups_of(2, 3, dtype, device))),
         (ops.rotated_match, (a, b, torch.tensor([0, 2, 5], device=device))),
     ):
         torch.library.opcheck(op, arguments)
@@ -699,6 +752,10 @@ def compiled_cases() -> dict[str, tuple[Callable[..., object], Callable[[int], t
         "rotated_overlap_pairs": (rotated.rotated_overlap_pairs, lambda n: (boxes(n), boxes(n).flip(0))),
         "rotated_nms": (rotated.rotated_nms, lambda n: (*scored(n), 1 / n)),
         "nms_order": (rotated.nms_order, lambda n: (*scored(n), 1 / n)),
+        "nms_groups": (
+            rotated.nms_groups,
+            lambda n: (boxes(2 * n).view(2, n, 7), *groups_of(2, n, torch.float32)),
+        ),
         "rotated_match": (rotated.rotated_match, lambda n: (boxes(n + 7), boxes(n), torch.tensor([0, 3, n]))),
         "box_iou_rotated": (rotated.box_iou_rotated, lambda n: (in_image(n)[0], in_image(n + 1)[0])),
         "nms_rotated": (lambda b, s, _: rotated.nms_rotated(b, s, 0.2), in_image),

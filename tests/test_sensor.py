@@ -88,6 +88,7 @@ def test_a_reflectance_that_never_changes_is_none() -> None:
 # --- arrays ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("threads")
 def test_every_kind_of_array_gives_the_same_points() -> None:
     points = street(count=50).numpy()
     read_only = points.copy()
@@ -150,6 +151,7 @@ def test_too_bright_is_what_is_in_range() -> None:
 # --- ground ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("ground", [-3.2, -1.73, -0.33, 0.0, 12.0])
 def test_the_ground_is_found(ground: float) -> None:
     found = find_ground(street(ground))
@@ -157,12 +159,14 @@ def test_the_ground_is_found(ground: float) -> None:
     assert float(found) == pytest.approx(ground, abs=0.05)
 
 
+@pytest.mark.usefixtures("threads")
 def test_the_ground_of_a_sensor_high_up() -> None:
     """Which sees it from 20 m on only."""
     points = street(-6.0)
     assert float(find_ground(points[torch.hypot(points[:, 0], points[:, 1]) > 20])) == pytest.approx(-6, abs=0.05)
 
 
+@pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("points", [
     torch.zeros(0, 4),
     torch.full((10, 4), torch.nan),

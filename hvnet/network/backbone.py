@@ -37,14 +37,14 @@ class ConvReLU(nn.Module):
     def __init__(self, convolution: nn.Conv2d) -> None:
         super().__init__()
         self.convolution = convolution
-        self.one_kernel: bool | None = None  # not known before the first call on CUDA, which tries it
+        self.one_kernel: dict[torch.Size, bool] = {}  # by the size of the input, whose first call on CUDA tries it
 
     def forward(self, features: Tensor) -> Tensor:
         """Features (B, C, H, W) to (B, C', H', W')."""
         if features.device.type == "cuda" and torch.backends.cudnn.is_available():
-            if self.one_kernel is None:
-                self.one_kernel = self.has_one_kernel(features)
-            if self.one_kernel:
+            if features.shape not in self.one_kernel:
+                self.one_kernel[features.shape] = self.has_one_kernel(features)
+            if self.one_kernel[features.shape]:
                 return self.by_cudnn(features)
         return F.relu_(self.convolution(features))
 
@@ -65,8 +65,9 @@ class ConvReLU(nn.Module):
             found = self.by_cudnn(features)
         except RuntimeError:  # no engine for these shapes, or this type
             return False
-        tolerance = 4 * torch.finfo(wanted.dtype).eps ** 0.5 if wanted.dtype == torch.float32 else 0.05
-        return bool(((found - wanted).abs().float() <= tolerance * wanted.abs().float().amax()).all())
+        # 16 bits round twice what cuDNN rounds once
+        tolerance = 2e-3 if wanted.dtype == torch.float32 else 0.05
+        return bool(((found - wanted).abs() <= tolerance * wanted.abs().amax()).all())
 
 
 class Block(nn.Module):

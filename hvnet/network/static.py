@@ -37,9 +37,10 @@ class BoxSteps:
         lengths = [len(each) for each in anchors]
         self.longest = max(lengths)
         self.kept = min(head.candidates, self.longest)
+        boxes = torch.cat(list(anchors)).float()
         starts = torch.tensor([0, *lengths[:-1]], dtype=torch.int32).cumsum(0, dtype=torch.int32)
         self.anchors = AnchorTable(
-            torch.cat([each.float() for each in anchors]),
+            torch.cat((boxes, boxes[:, 6:].cos(), boxes[:, 6:].sin()), dim=1),
             starts.to(self.device),
             torch.tensor(self.per_cell, dtype=torch.int32, device=self.device),
             weights[0].shape[1] // self.per_cell[0],
