@@ -24,14 +24,14 @@ def limit_angle(angle: Tensor) -> Tensor:
 
 def bev_corners(boxes: Tensor) -> Tensor:
     """Corners of boxes (..., 7) in bird's eye view: (..., 4, 2), front-left, front-right, rear-right, rear-left."""
-    # halves are exact, and no constant is copied to a GPU
-    length, width = boxes[..., 3:4] / 2, boxes[..., 4:5] / 2
-    along = torch.cat((length, length, -length, -length), dim=-1)
-    across = torch.cat((width, -width, -width, width), dim=-1)
-    cos, sin = boxes[..., 6:7].cos(), boxes[..., 6:7].sin()
-    x = boxes[..., 0:1] + along * cos - across * sin
-    y = boxes[..., 1:2] + along * sin + across * cos
-    return torch.stack((x, y), dim=-1)
+    x, y, length, width, yaw = (boxes[..., k] for k in (0, 1, 3, 4, 6))
+    cos, sin = yaw.cos(), yaw.sin()
+    length, width = length / 2, width / 2
+    ahead_x, ahead_y, side_x, side_y = length * cos, length * sin, width * sin, width * cos
+    front_x, front_y, rear_x, rear_y = x + ahead_x, y + ahead_y, x - ahead_x, y - ahead_y
+    corners = [front_x - side_x, front_y + side_y, front_x + side_x, front_y - side_y]
+    corners += [rear_x + side_x, rear_y - side_y, rear_x - side_x, rear_y + side_y]
+    return torch.stack(corners, dim=-1).unflatten(-1, (4, 2))
 
 
 def box_corners(boxes: Tensor) -> Tensor:

@@ -36,15 +36,16 @@ class AnchorTable(NamedTuple):
     """MAX_SIZE, MAX_HEIGHT, MAX_SHIFT and MAX_OUTPUT of `anchors.decode`."""
 
 
-def write_keys(logits: Tensor, iou: Tensor | None, threshold: float, keys: Tensor) -> None:
-    """Writes the keys of a class: (B, A') int64, of its A <= A' anchors; negative where a score is no candidate's.
+def write_keys(logits: Tensor, iou: Tensor | None, threshold: float, label: int, keys: Tensor) -> None:
+    """Writes the keys of the A anchors of a class to keys (B, C, A' >= A) int64; negative where there is no candidate.
 
     logits, iou: (B, A), of float32, float16 or bfloat16; the score is the product of their sigmoids. It has to be above
     the threshold, which is not negative; NaN is not.
     """
     other = logits if iou is None else iou
-    inputs = [array(logits), array(other), int(iou is not None), threshold, array(keys)]
-    launch(_kernels(wp.dtype_from_torch(logits.dtype)).write_keys, keys.shape, inputs, logits.device)
+    inputs = [array(logits), array(other), int(iou is not None), threshold, label, array(keys)]
+    size = (keys.shape[0], keys.shape[2])
+    launch(_kernels(wp.dtype_from_torch(logits.dtype)).write_keys, size, inputs, logits.device)
 
 
 def gather_patches(level: Tensor, keys: Tensor, label: int, per_cell: int, patches: Tensor) -> None:
@@ -90,7 +91,8 @@ def _kernels(dtype: Any) -> SimpleNamespace:
         iou: wp.array2d(dtype=dtype),
         has_iou: int,
         threshold: float,
-        keys: wp.array2d(dtype=wp.int64),
+        label: int,
+        keys: wp.array3d(dtype=wp.int64),
     ):
         b, a = wp.tid()
         key = wp.int64(-1)
@@ -100,7 +102,7 @@ def _kernels(dtype: Any) -> SimpleNamespace:
                 score *= _sigmoid(float(iou[b, a]))
             if score > threshold:  # and so above 0: the order of its bits is that of its value
                 key = (wp.int64(wp.cast(score, wp.int32)) << wp.int64(32)) | wp.int64(LARGEST - a)
-        keys[b, a] = key
+        keys[b, label, a] = key
 
     @wp.kernel(enable_backward=False, module=module)
     def gather_patches(

@@ -217,8 +217,11 @@ def rotated_nms(boxes: Tensor, scores: Tensor, iou_threshold: float) -> Tensor:
 
 
 def nms_groups(boxes: Tensor, valid: Tensor, counts: Tensor, iou_thresholds: Tensor, limit: int) -> Tensor:
-    """Which boxes (G, M, 7) are kept (G, M): of the first counts[g] of a group g that are valid, from the first on, all
-    whose IoU with those kept before does not exceed iou_thresholds[g % T], `limit` at most."""
+    """Which boxes (G, M, 7 or more) are kept (G, M).
+
+    From the first on, of the first counts[g] of a group g that are valid, all whose IoU with those kept before does not
+    exceed iou_thresholds[g % T], `limit` at most.
+    """
     keep = torch.zeros_like(valid)
     for g, rows in enumerate(boxes.tolist()):
         kept: list[int] = []

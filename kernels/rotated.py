@@ -295,17 +295,19 @@ def nms_order(boxes: Tensor, scores: Tensor, iou_threshold: float) -> tuple[Tens
 
 
 def nms_groups(boxes: Tensor, valid: Tensor, counts: Tensor, iou_thresholds: Tensor, limit: int) -> Tensor:
-    """Greedy NMS of G groups of boxes (G, M, 7) at once, each with its best box first: which are kept (G, M) bool.
+    """Greedy NMS of G groups of boxes at once, each with its best box first: which are kept (G, M) bool.
 
+    boxes: (G, M, 7 or more), float32 or float64; what follows a box is not read
     valid: (G, M) bool; a box that is not is not kept and drops none
     counts: (G,) int32, at most M: the boxes of each group, those after them only fill up the array
     iou_thresholds: (T,) of the boxes' dtype; group g has the threshold g % T
     limit: how many boxes of a group are kept at most
 
-    Nothing is read from the device. Boxes may be a part of wider rows. Raises TypeError or ValueError naming the
-    argument.
+    Nothing is read from the device. Raises TypeError or ValueError naming the argument.
     """
-    check_tensor("boxes", boxes, FLOATS, (None, None, 7))
+    check_tensor("boxes", boxes, FLOATS, (None, None, None))
+    if boxes.shape[2] < 7:
+        raise ValueError(f"boxes: want 7 columns or more, got {boxes.shape[2]}")
     check_tensor("valid", valid, (torch.bool,), tuple(boxes.shape[:2]), like=boxes)
     check_tensor("counts", counts, (torch.int32,), (boxes.shape[0],), like=boxes)
     check_tensor("iou_thresholds", iou_thresholds, (boxes.dtype,), (None,), like=boxes)
@@ -313,7 +315,9 @@ def nms_groups(boxes: Tensor, valid: Tensor, counts: Tensor, iou_thresholds: Ten
         raise ValueError("iou_thresholds: want one or more, got none")
     if limit < 0:
         raise ValueError(f"limit: want 0 or more, got {limit}")
-    return _nms_groups(boxes.detach(), valid.contiguous(), counts.contiguous(), iou_thresholds.contiguous(), limit)
+    return _nms_groups(
+        boxes.detach().contiguous(), valid.contiguous(), counts.contiguous(), iou_thresholds.contiguous(), limit
+    )
 
 
 def rotated_match(anchors: Tensor, boxes: Tensor, starts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -511,7 +515,7 @@ def _suppress_in_parallel(boxes: Tensor, iou_threshold: float, keep: Tensor) -> 
     """Many threads compare all pairs into a mask of bits, which one warp sweeps."""
     counts = torch.full((1,), len(boxes), dtype=torch.int32, device=boxes.device)
     threshold = torch.full((1,), iou_threshold, dtype=boxes.dtype, device=boxes.device)
-    keep.copy_(_nms_groups(boxes[None], keep[None], counts, threshold, len(boxes))[0])
+    keep.copy_(_nms_groups(boxes[None].contiguous(), keep[None], counts, threshold, len(boxes))[0])
 
 
 def _nms_groups_outputs(boxes: Tensor, valid: Tensor, counts: Tensor, iou_thresholds: Tensor, limit: int) -> Tensor:

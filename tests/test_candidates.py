@@ -28,7 +28,7 @@ def test_keys(has_iou: bool, dtype: torch.dtype, device: torch.device) -> None:
     iou[0, :4] = 40.0
     threshold = 0.5
     keys = torch.full((2, 3, 320), 7, dtype=torch.int64, device=device)
-    write_keys(logits.to(device), iou.to(device) if has_iou else None, threshold, keys[:, 1])
+    write_keys(logits.to(device), iou.to(device) if has_iou else None, threshold, 1, keys)
     assert (keys[:, [0, 2]] == 7).all()
     keys = keys[:, 1].cpu()
     wanted = scores_of(logits.float(), iou.float() if has_iou else None)

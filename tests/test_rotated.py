@@ -277,15 +277,16 @@ def test_nms_of_groups_equals_twin(
     assert kept.sum(dim=1).max() <= limit
     if limit == 200:
         assert 10 < kept[5].sum() < 120
-    wide = torch.zeros(6, 130, 10, dtype=dtype)
-    wide[..., :7] = boxes  # a part of wider rows
-    assert torch.equal(kept, rotated.nms_groups(wide.to(device)[..., :7], *(g.to(device) for g in given[1:]), limit))
+    wide = torch.cat((boxes, torch.full((6, 130, 3), torch.nan, dtype=dtype)), dim=2)
+    for rows in (wide, wide[..., :7]):
+        assert torch.equal(kept, rotated.nms_groups(rows.to(device), *(each.to(device) for each in given[1:]), limit))
 
 
 def test_bad_groups() -> None:
     boxes, valid, counts = torch.ones(2, 3, 7), torch.ones(2, 3, dtype=torch.bool), torch.ones(2, dtype=torch.int32)
     for change, error, said in (
-        ({"boxes": boxes[0]}, ValueError, r"boxes: want shape \(any, any, 7\)"),
+        ({"boxes": boxes[0]}, ValueError, r"boxes: want shape \(any, any, any\)"),
+        ({"boxes": boxes[..., :6]}, ValueError, "boxes: want 7 columns or more, got 6"),
         ({"valid": valid[:1]}, ValueError, r"valid: want shape \(2, 3\)"),
         ({"valid": counts}, TypeError, "valid: want dtype"),
         ({"counts": counts.long()}, TypeError, "counts: want dtype"),

@@ -61,7 +61,7 @@ class BoxSteps:
         keys = torch.empty(len(maps[0][0]), len(maps), self.longest, dtype=torch.int64, device=self.device)
         for label, of_class in enumerate(maps):
             logits, *iou = [each.permute(0, 2, 3, 1).contiguous().flatten(1) for each in of_class]
-            write_keys(logits, iou[0] if iou else None, self.head.score_threshold, keys[:, label])
+            write_keys(logits, iou[0] if iou else None, self.head.score_threshold, label, keys)
         return keys
 
     def candidates(self, levels: Sequence[Tensor], keys: Tensor) -> Rows:
@@ -78,11 +78,10 @@ class BoxSteps:
 
     def suppress(self, rows: Rows) -> Tensor:
         """Rotated NMS of every class and sample: the table with its last column."""
-        samples, classes, count = rows.valid.shape
-        groups = (samples * classes, count)
-        boxes, valid = rows.table.view(*groups, COLUMNS)[..., :7], rows.valid.view(groups)
-        keep = nms_groups(boxes, valid, rows.counts, self.thresholds, self.head.detections)
-        rows.table.view(*groups, COLUMNS)[..., -1].copy_(keep)
+        count = rows.valid.shape[2]
+        table, valid = rows.table.view(-1, count, COLUMNS), rows.valid.view(-1, count)
+        keep = nms_groups(table, valid, rows.counts, self.thresholds, self.head.detections)
+        table[..., -1].copy_(keep)
         return rows.table
 
 
