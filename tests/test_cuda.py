@@ -280,8 +280,8 @@ def test_images_of_a_detector(scales: tuple[tuple[float, ...], tuple[float, ...]
 
 
 def test_what_tf32_costs(street: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The products of a detector's encoder at the paper's setting, of numbers rounded to 11 bits, move no value by 0.1 %
-    of the largest: by 0.04 % where a CPU rounds them so."""
+    """At the paper's setting products of numbers of 11 bits move no value by 0.1 % of the largest (0.04 % where a CPU
+    rounds them so)."""
     torch.manual_seed(5)
     encoder = HybridVoxelEncoder(EncoderConfig()).to(GPU)
     points, sample = street.to(GPU), torch.zeros(len(street), dtype=torch.int64, device=GPU)
