@@ -147,12 +147,13 @@ def _kernels(dtype: Any) -> SimpleNamespace:
         g, i, word = wp.tid()
         if word == 0:
             keep[g, i] = False  # until the sweep says otherwise
-        if i < counts[g] and word >= i // WORD and word * WORD < counts[g]:
+        count = wp.min(counts[g], boxes.shape[1])
+        if i < count and word >= i // WORD and word * WORD < count:
             threshold = thresholds[g % thresholds.shape[0]]
             bits = wp.int64(0)
             for bit in range(WORD):
                 j = word * WORD + bit
-                if j > i and j < counts[g] and iou_in_group(boxes, g, i, j) > threshold:
+                if j > i and j < count and iou_in_group(boxes, g, i, j) > threshold:
                     bits = bits | (wp.int64(1) << wp.int64(bit))
             mask[g, i, word] = bits
 
@@ -222,7 +223,7 @@ def _nms_sweep(
     walk has come to.
     """
     g, lane = wp.tid()
-    count = counts[g]
+    count = wp.min(counts[g], valid.shape[1])
     words = (count + WORD - 1) // WORD
     for k in range(lane, words, lanes):
         removed[g, k] = wp.int64(0)
@@ -299,7 +300,7 @@ def nms_groups(boxes: Tensor, valid: Tensor, counts: Tensor, iou_thresholds: Ten
 
     boxes: (G, M, 7 or more), float32 or float64; what follows a box is not read
     valid: (G, M) bool; a box that is not is not kept and drops none
-    counts: (G,) int32, at most M: the boxes of each group, those after them only fill up the array
+    counts: (G,) int32: the boxes of each group, those after them only fill up the array
     iou_thresholds: (T,) of the boxes' dtype; group g has the threshold g % T
     limit: how many boxes of a group are kept at most
 

@@ -261,7 +261,7 @@ def test_nms_of_groups_equals_twin(
     thresholds: tuple[float, ...], limit: int, dtype: torch.dtype, device: torch.device
 ) -> None:
     """Groups without a box, with a few, with one word and one more, and full ones; each has its own threshold."""
-    counts = torch.tensor([0, 1, 64, 65, 130, 130], dtype=torch.int32)
+    counts = torch.tensor([0, 1, 64, 65, 130, 999], dtype=torch.int32)  # the last: all that there are
     boxes = random_boxes(6 * 130, 31, spread=9).to(dtype).view(6, 130, 7)
     valid = torch.rand(6, 130, generator=torch.Generator().manual_seed(0)) > 0.1
     boxes[2, ~valid[2]] = torch.nan
