@@ -5,13 +5,14 @@ is launched, what is calculated and what goes between host and device is written
 what they cannot do in a build of torch without CUDA (indexing, conversions) is done here by other operations.
 """
 
+import sys
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from unittest import mock
 
 import torch
@@ -30,6 +31,7 @@ from hvnet.kernels import launch
 FOLDER = Path(__file__).resolve().parent
 ROOT = FOLDER.parent
 CUDA = torch.device("cuda:0")
+HALF = (torch.bfloat16, torch.float16)
 NO_WORK = {"detach", "lift_fresh", "_unsafe_view", "_reshape_alias"}
 """Operations that calculate nothing; so do those whose outputs are views, and those that only allocate."""
 
@@ -46,6 +48,19 @@ class ReadsDevice(Exception):
     """The code waits for a value of the device."""
 
 
+class Work(NamedTuple):
+    """One launch of Warp, or one operation of torch."""
+
+    name: str
+    bytes: float  # of all tensors that it is given and gives
+    flops: float
+    half: bool  # its result is bfloat16 or float16
+    functions: tuple[str, ...]  # of the project that were running, the innermost first
+    tensors: tuple[tuple[tuple[int, ...], int], ...] = ()  # of a launch: shapes and bytes a number
+    threads: tuple[int, ...] = ()  # of a launch
+    arguments: tuple[str, ...] = ()  # of a kernel
+
+
 @dataclass
 class Record:
     """What ran on the fake device."""
@@ -54,7 +69,7 @@ class Record:
     operations: Counter[str] = field(default_factory=Counter)  # of torch, those that calculate
     from_host: Counter[str] = field(default_factory=Counter)  # copies, by the line of the project that makes them
     to_host: Counter[str] = field(default_factory=Counter)
-    work: list[tuple[str, float, float]] = field(default_factory=list)  # name, bytes and floating-point operations
+    work: list[Work] = field(default_factory=list)
 
     @property
     def count(self) -> int:
@@ -68,20 +83,24 @@ class Watch(TorchDispatchMode):
     `sizes` replaces operations of the project whose results have lengths that depend on data.
     """
 
-    def __init__(self, record: Record, sizes: dict[str, Callable[..., Any]]) -> None:
+    def __init__(self, record: Record, device: torch.device, sizes: dict[str, Callable[..., Any]]) -> None:
         super().__init__()
-        self.record, self.sizes = record, sizes
+        self.record, self.device, self.sizes = record, device, sizes
 
     def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: dict[str, Any] | None = None) -> Any:
         kwargs = kwargs or {}
         space, _, name = func._schema.name.partition("::")
         if space == "hvnet":
-            with self, OtherWays():
+            with self, OtherWays() if self.device == CUDA else nullcontext():
                 return self.sizes.get(name, OPDEFS[func._schema.name]._init_fn)(*args, **kwargs)
         inputs = [each for each in tree_leaves((args, kwargs)) if isinstance(each, Tensor)]
         devices = {each.device.type for each in inputs}
-        copies_to = args[0].device if name == "copy_" else kwargs.get("device")
-        if name in ("_to_copy", "copy_") and copies_to is not None and {*devices, copies_to.type} == {"cpu", "cuda"}:
+        copies_to = args[0].device if name in ("copy", "copy_") else kwargs.get("device")
+        if (
+            name in ("_to_copy", "copy", "copy_")
+            and copies_to is not None
+            and {*devices, copies_to.type} == {"cpu", "cuda"}
+        ):
             self.copied(name, to_host=copies_to.type == "cpu")
         of_mask = name == "index" and any(each is not None and each.dtype == torch.bool for each in args[1])
         if "cuda" in devices and (name in READS or of_mask):
@@ -92,13 +111,14 @@ class Watch(TorchDispatchMode):
         else:
             output = func(*args, **kwargs)
         outputs = [each for each in tree_leaves(output) if isinstance(each, Tensor)]
-        on_device = any(each.device.type == "cuda" for each in outputs)
+        on_device = any(each.device.type == self.device.type for each in outputs)
         if on_device and not func.is_view and name not in NO_WORK and not name.startswith(("empty", "new_empty")):
             self.record.operations[name] += 1
             moved = sum(each.numel() * each.element_size() for each in (*inputs, *outputs))
             product = flop_registry.get(func._overloadpacket)
             flops = product(*args, **kwargs, out_val=output) if product else sum(each.numel() for each in outputs)
-            self.record.work.append((name, float(moved), float(flops)))
+            half = any(each.dtype in HALF for each in outputs)
+            self.record.work.append(Work(name, float(moved), float(flops), half, running()))
         return output
 
     def copied(self, name: str, *, to_host: bool) -> None:
@@ -107,6 +127,16 @@ class Watch(TorchDispatchMode):
         (self.record.to_host if to_host else self.record.from_host)[where] += 1
         if to_host:
             raise ToHost(where)
+
+
+def running() -> tuple[str, ...]:
+    """The functions of the project that are running, the innermost first."""
+    names, frame = [], sys._getframe(1)
+    while frame is not None:
+        if "/hvnet/" in frame.f_code.co_filename:
+            names.append(frame.f_code.co_name)
+        frame = frame.f_back  # type: ignore[assignment]
+    return tuple(names)
 
 
 def line_of_project() -> str:
@@ -129,7 +159,11 @@ class OtherWays(TorchFunctionMode):
         if func is Tensor.__setitem__ and args[0].device.type == "cuda":
             target, key, value = args
             part = indexed(target, key)
-            return part.copy_(value) if isinstance(value, Tensor) else part.fill_(value)
+            return copy(part, value) if isinstance(value, Tensor) else part.fill_(value)
+        if func is Tensor.__invert__:
+            return torch.ops.aten.bitwise_not.default(args[0])
+        if func is Tensor.copy_:
+            return copy(args[0], args[1])
         if func is Tensor.new_tensor and args[0].device.type == "cuda":
             made = torch.tensor(args[1], dtype=kwargs.get("dtype", args[0].dtype))
             return convert(made, kwargs.get("device", args[0].device))
@@ -140,6 +174,9 @@ class OtherWays(TorchFunctionMode):
                 *args[1:], **{k: v for k, v in kwargs.items() if k != "copy"}
             )
             return convert(args[0], device or args[0].device, dtype, memory_format)
+        if func is Tensor.contiguous and args[0].device.type == "cuda":
+            layout = {"memory_format": kwargs.get("memory_format", torch.contiguous_format)}
+            return args[0] if args[0].is_contiguous(**layout) else torch.ops.aten.clone.default(args[0], **layout)
         if getattr(func, "__name__", "") in READS and args[0].device.type == "cuda":
             raise ReadsDevice(f"{line_of_project()}: {func.__name__}")
         if func is Tensor.cpu:
@@ -157,6 +194,12 @@ def convert(
     device = CUDA if device.type == "cuda" else device
     options = {} if memory_format is None else {"memory_format": memory_format}
     return torch.ops.aten._to_copy.default(tensor, device=device, dtype=dtype or tensor.dtype, **options)
+
+
+def copy(target: Tensor, source: Tensor) -> Tensor:
+    """`target.copy_(source)`: what it gives has no data to be written."""
+    torch.ops.aten.copy.default(target, source)
+    return target
 
 
 def indexed(tensor: Tensor, key: Any) -> Tensor:
@@ -209,34 +252,39 @@ def deepcopy(tensor: Tensor, memo: dict[int, Tensor]) -> Tensor:
 
 
 @contextmanager
-def fake_cuda(**sizes: Callable[..., Any]) -> Iterator[Record]:
-    """What runs inside may use cuda:0. `sizes`: operations of the project to replace, see `Watch`."""
+def fake_cuda(device: torch.device = CUDA, **sizes: Callable[..., Any]) -> Iterator[Record]:
+    """What runs inside may use cuda:0; or the CPU, on the ways of a GPU, where gradients are wanted: torch's autograd
+    cannot do without a CUDA build. `sizes`: operations of the project to replace, see `Watch`."""
     record = Record()
 
     def launched(kernel: wp.Kernel, dim: Any, inputs: Any, **options: Any) -> None:
         tensors = [each for each in inputs if isinstance(each, Tensor)]
-        assert all(each.device == CUDA for each in tensors), f"{kernel.key}: {[each.device for each in tensors]}"
+        assert all(each.device == device for each in tensors), f"{kernel.key}: {[each.device for each in tensors]}"
         record.launches[name_of(kernel)] += 1
         moved = sum(each.numel() * each.element_size() for each in tensors)
-        record.work.append((name_of(kernel), float(moved), 0.0))
+        shapes = tuple((tuple(each.shape), each.element_size()) for each in tensors)
+        threads = (dim,) if isinstance(dim, int) else tuple(dim)
+        arguments = tuple(each.label for each in kernel.adj.args)
+        record.work.append(Work(name_of(kernel), float(moved), 0.0, False, running(), shapes, threads, arguments))
 
     with ExitStack() as stack:
-        patch = mock.patch.object
         for owner, name, value in (
             (wp, "launch", launched),
             (wp, "from_torch", lambda tensor, **options: tensor),
             (wp, "is_cuda_available", lambda: True),
             (launch, "current_stream", lambda device: None),
-            (torch.cuda, "device", lambda device: nullcontext()),
+            (launch, "force_many_threads", True),
             (nn.Module, "_apply", apply),
             (Tensor, "__deepcopy__", deepcopy),
             (nn.Parameter, "__deepcopy__", deepcopy),
+            (torch.cuda, "device", lambda device: nullcontext()),
             (torch.cuda, "get_device_capability", lambda device=None: (9, 0)),
         ):
-            stack.enter_context(patch(owner, name, value))
+            stack.enter_context(mock.patch.object(owner, name, value))
         stack.enter_context(FakeTensorMode(allow_non_fake_inputs=True))
-        stack.enter_context(OtherWays())
-        stack.enter_context(Watch(record, sizes))
+        if device == CUDA:
+            stack.enter_context(OtherWays())
+        stack.enter_context(Watch(record, device, sizes))
         yield record
 
 

@@ -18,12 +18,6 @@ from tests.models import CONFIGS
 POINTS = 65536
 
 
-def points_of(batch_size: int) -> tuple[Tensor, Tensor]:
-    return torch.empty(batch_size * POINTS, 4, device=CUDA), torch.zeros(
-        batch_size * POINTS, dtype=torch.int64, device=CUDA
-    )
-
-
 def after_warm_up(run: Callable[[], object], record: Record) -> Counter[str]:
     """Runs a function twice: the copies from the host of the second time. A copy to the host ends a run."""
     for _ in range(2):
@@ -35,24 +29,23 @@ def after_warm_up(run: Callable[[], object], record: Record) -> Counter[str]:
 
 
 def frame(detector: Detector, batch_size: int) -> object:
-    """From points to boxes, as the detector goes."""
-    images = detector.encode(*points_of(batch_size), batch_size)
-    levels, scores = detector.score(detector.backbone(images))
-    return detector.suppress(detector.candidates(levels, scores))
+    """From points to boxes on the host, as the detector goes."""
+    points, counts = torch.empty(batch_size, POINTS, 4, device=CUDA), torch.empty(batch_size, device=CUDA).int()
+    return detector.numbers(points, counts, torch.zeros(batch_size * POINTS, device=CUDA).long()).cpu()
 
 
 def step(model: HVNet, batch_size: int) -> object:
     """From points to losses, as training goes."""
-    maps = model(*points_of(batch_size), batch_size)
+    maps = model(torch.empty(POINTS, 4, device=CUDA), torch.zeros(POINTS, device=CUDA).long(), batch_size)
     boxes = [torch.empty(6, 7, device=CUDA) for _ in range(batch_size)]
-    labels = [torch.zeros(6, dtype=torch.int64, device=CUDA) for _ in range(batch_size)]
+    labels = [torch.zeros(6, device=CUDA).long() for _ in range(batch_size)]
     return model.loss(maps, boxes, labels)
 
 
 @pytest.mark.parametrize(("config", "batch_size"), [("hvnet", 1), ("compact", 2)])
 def test_a_frame_asks_the_host_for_nothing(config: str, batch_size: int) -> None:
     with fake_cuda() as record, torch.no_grad():
-        detector = Detector(HVNet(load_config(CONFIGS / f"{config}.yaml")).eval(), CUDA)
+        detector = Detector(HVNet(load_config(CONFIGS / f"{config}.yaml")).eval(), CUDA, ground=-1.7)
         assert after_warm_up(lambda: frame(detector, batch_size), record) == Counter()
         assert record.to_host.total() == 1  # the boxes, and the end
         assert record.launches.total() > 10
