@@ -8,7 +8,7 @@ what they cannot do in a build of torch without CUDA (indexing, conversions) is 
 import sys
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,6 +31,8 @@ from hvnet.kernels import launch
 FOLDER = Path(__file__).resolve().parent
 ROOT = FOLDER.parent
 CUDA = torch.device("cuda:0")
+CHANNELS_LAST = torch.channels_last
+CONVOLUTION = torch.ops.aten.convolution
 HALF = (torch.bfloat16, torch.float16)
 NO_WORK = {"detach", "lift_fresh", "_unsafe_view", "_reshape_alias"}
 """Operations that calculate nothing; so do those whose outputs are views, and those that only allocate."""
@@ -54,7 +56,7 @@ class Work(NamedTuple):
     name: str
     bytes: float  # of all tensors that it is given and gives
     flops: float
-    half: bool  # its result is bfloat16 or float16
+    kind: str  # of arithmetic: single, tf32 or half
     functions: tuple[str, ...]  # of the project that were running, the innermost first
     tensors: tuple[tuple[tuple[int, ...], int], ...] = ()  # of a launch: shapes and bytes a number
     threads: tuple[int, ...] = ()  # of a launch
@@ -105,20 +107,30 @@ class Watch(TorchDispatchMode):
         of_mask = name == "index" and any(each is not None and each.dtype == torch.bool for each in args[1])
         if "cuda" in devices and (name in READS or of_mask):
             raise ReadsDevice(f"{line_of_project()}: {name}")
+        output: Any
         if "batch_norm" in name:  # torch's fake writes running statistics in a way that asks for a device guard
             channels = args[0].shape[1]
             output = torch.empty_like(args[0]), args[0].new_empty(channels), args[0].new_empty(channels)
+        elif name == "cudnn_convolution_relu":  # a build without CUDA has no fake of it
+            image, weight, bias, stride, padding, dilation, groups = args
+            output = CONVOLUTION.default(image, weight, bias, stride, padding, dilation, False, [0, 0], groups)
         else:
             output = func(*args, **kwargs)
+        if name.endswith(("convolution", "convolution_relu")) and args[0].is_contiguous(memory_format=CHANNELS_LAST):
+            output = torch.empty_like(output, memory_format=CHANNELS_LAST)  # as cuDNN does
         outputs = [each for each in tree_leaves(output) if isinstance(each, Tensor)]
         on_device = any(each.device.type == self.device.type for each in outputs)
         if on_device and not func.is_view and name not in NO_WORK and not name.startswith(("empty", "new_empty")):
             self.record.operations[name] += 1
             moved = sum(each.numel() * each.element_size() for each in (*inputs, *outputs))
-            product = flop_registry.get(func._overloadpacket)
-            flops = product(*args, **kwargs, out_val=output) if product else sum(each.numel() for each in outputs)
-            half = any(each.dtype in HALF for each in outputs)
-            self.record.work.append(Work(name, float(moved), float(flops), half, running()))
+            if name.startswith("cudnn_convolution"):
+                flops = flop_registry[CONVOLUTION](*args[:6], False, out_val=output)
+            elif product := flop_registry.get(func._overloadpacket):
+                flops = product(*args, **kwargs, out_val=output)
+            else:
+                flops = sum(each.numel() for each in outputs)
+            kind = "half" if any(each.dtype in HALF for each in outputs) else kind_of_single(name)
+            self.record.work.append(Work(name, float(moved), float(flops), kind, running()))
         return output
 
     def copied(self, name: str, *, to_host: bool) -> None:
@@ -127,6 +139,13 @@ class Watch(TorchDispatchMode):
         (self.record.to_host if to_host else self.record.from_host)[where] += 1
         if to_host:
             raise ToHost(where)
+
+
+def kind_of_single(name: str) -> str:
+    """How torch is set to work in float32: in TF32 or not."""
+    if "convolution" in name:
+        return "tf32" if torch.backends.cudnn.allow_tf32 else "single"
+    return "tf32" if torch.backends.cuda.matmul.fp32_precision == "tf32" else "single"
 
 
 def running() -> tuple[str, ...]:
@@ -160,6 +179,8 @@ class OtherWays(TorchFunctionMode):
             target, key, value = args
             part = indexed(target, key)
             return copy(part, value) if isinstance(value, Tensor) else part.fill_(value)
+        if func is torch.cudnn_convolution_relu:
+            return torch.ops.aten.cudnn_convolution_relu.default(*args)
         if func is Tensor.__invert__:
             return torch.ops.aten.bitwise_not.default(args[0])
         if func is Tensor.copy_:
@@ -265,7 +286,7 @@ def fake_cuda(device: torch.device = CUDA, **sizes: Callable[..., Any]) -> Itera
         shapes = tuple((tuple(each.shape), each.element_size()) for each in tensors)
         threads = (dim,) if isinstance(dim, int) else tuple(dim)
         arguments = tuple(each.label for each in kernel.adj.args)
-        record.work.append(Work(name_of(kernel), float(moved), 0.0, False, running(), shapes, threads, arguments))
+        record.work.append(Work(name_of(kernel), float(moved), 0.0, "single", running(), shapes, threads, arguments))
 
     with ExitStack() as stack:
         for owner, name, value in (
@@ -288,10 +309,13 @@ def fake_cuda(device: torch.device = CUDA, **sizes: Callable[..., Any]) -> Itera
         yield record
 
 
-def index_of_known_length(points: Tensor, sample: Tensor, batch_size: int, flat: list[float]) -> list[Tensor]:
-    """In the place of `hvnet::voxel_index`, whose lengths training reads once: all points, in half as many voxels."""
-    count = points.shape[0]
+def index_of_known_length(
+    points: Tensor, sample: Tensor, batch_size: int, flat: Sequence[float], voxels: Sequence[int] = ()
+) -> list[Tensor]:
+    """In the place of `hvnet::voxel_index`, whose lengths training reads once: all points, in as many voxels of every
+    scale, by default in half as many as there are points."""
+    count, scales = points.shape[0], len(flat) // 10
     parts = [sample.new_empty(count)]
-    for _ in range(len(flat) // 10):
-        parts += [sample.new_empty(count // 2), sample.new_empty(count), sample.new_empty(count // 2 + 1)]
+    for of_scale in voxels or [count // 2] * scales:
+        parts += [sample.new_empty(of_scale), sample.new_empty(count), sample.new_empty(of_scale + 1)]
     return parts

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import re
 import runpy
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from cuda_kernels import PIP, find_kernels, tool
 
 from tests.helpers import ROOT
 
@@ -190,3 +192,41 @@ def test_stages_of_training(tmp_path: Path) -> None:
     assert {row["stage"]: float(row["p50_ms"]) for row in tree["rows"]} == rows
     assert set(tree["machine"]) >= MACHINE
     assert 0.5 < rows.pop("step") / sum(rows.values()) < 1.5
+
+
+def test_report_of_what_a_gpu_would_do(tmp_path: Path) -> None:
+    if tool("cuobjdump") is None or tool("nvdisasm") is None:
+        pytest.skip(f"cuobjdump or nvdisasm is missing: {PIP}")
+    file, points = tmp_path / "report.json", tmp_path / "points.bin"
+    points.write_bytes((torch.rand(3000, 4) * torch.tensor([60.0, 20.0, 1.0, 1.0])).numpy().tobytes())
+    few = "import cuda_kernels as m; f = m.find_kernels; m.find_kernels = lambda: f()[:4]"  # compiling takes its time
+    done = bench("cuda_report", "--json", str(file), "--points", str(points), first=few)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert max(map(len, done.stdout.splitlines())) <= 120
+    assert re.findall(r"(?:holds|does not hold)$", done.stdout, re.MULTILINE)[2:]
+    tree = json.loads(file.read_text(encoding="utf-8"))
+    assert [row["name"] for row in tree["kernels"]] == [each.name for each in find_kernels()[:4]]
+    assert all(row["registers"] > 0 and row["stack"] >= 0 for row in tree["kernels"])
+    assert all(set(row["load_bytes"]) <= {"1", "2", "4", "8", "16"} for row in tree["kernels"])
+    for part in ("frame", "training"):
+        stages = {row["stage"]: row for row in tree[part]}
+        assert len(stages) == len(tree[part])
+        assert all(row["estimated_us"] >= row["floor_us"] >= 0 and row["launches"] > 0 for row in stages.values())
+        # of the paper's backbone; the training step has four clouds
+        convolutions = stages["convolutions"]["flops"] / (4 if part == "training" else 1)
+        assert 130e9 < convolutions < 170e9
+    outside = [row["stage"] for row in tree["frame"] if not row["in_graph"]]
+    assert outside == ["upload", "transfer"]
+    assert [row["holds"] for row in tree["bounds"]] == [
+        sum(row["estimated_us"] for row in tree["frame"]) <= 1000,
+        sum(row["launches"] for row in tree["frame"]) < 150,
+        next(row["estimated_us"] for row in tree["training"] if row["stage"] == "encode.backward") < 500,
+    ]
+
+
+def test_report_without_its_tools() -> None:
+    first = "import cuda_kernels; cuda_kernels.tool = lambda name: None"
+    done = bench("cuda_report", first=first)
+    assert done.returncode == 2
+    assert done.stderr.endswith("error: cuobjdump is missing: pip install nvidia-cuda-cuobjdump nvidia-cuda-nvdisasm\n")
+    assert len(done.stderr.splitlines()) == 1
