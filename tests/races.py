@@ -36,6 +36,10 @@ ODD = ["encoder.feature_channels=3", "encoder.image_channels=5"]
 """Channels that no vector length divides, so that one thread takes the same kernels as many."""
 
 
+MOST_BYTES = 500_000_000
+"""That are compared for a launch."""
+
+
 @dataclass
 class Seen:
     """What was seen of a kernel."""
@@ -53,8 +57,10 @@ def faults_of(command: wp.Launch, memory: Sequence[np.ndarray]) -> list[str]:
     before = [part.copy() for part in memory]
     joined = [part.copy() for part in memory]
     written = [np.zeros(part.shape, bool) for part in memory]
-    for thread in range(command.bounds.size):
-        command.bounds.coord_mult = thread_order.ALONE + thread
+    # one thread a part; where that takes too long, some that chance has put together
+    parts = min(command.bounds.size, max(2, MOST_BYTES // max(1, sum(part.nbytes for part in memory))))
+    for part in range(parts):
+        command.bounds.coord_mult = (parts << thread_order.PARTS) + part
         command.launch()
         for now, old, all_writes, taken in zip(memory, before, joined, written, strict=True):
             changed = np.flatnonzero(now != old)
@@ -111,7 +117,7 @@ def detect() -> None:
     maps = model(points, torch.zeros(len(points), dtype=torch.int64), 1)
     terms = model.loss(maps, [random_boxes(4, 0, centre=5.0).float()], [torch.tensor([0, 0, 1, 2])])
     torch.stack(list(terms.values())).sum().backward()
-    Detector(model.eval(), torch.device("cpu"), torch.float32)(points)
+    Detector(model.eval(), torch.device("cpu"), torch.float32, ground=-1.7).batch([points, points[:40]])
 
 
 def overlap() -> None:

@@ -1,4 +1,4 @@
-"""Warp's CPU launches run their threads in a random order, or one thread alone: a GPU keeps no order.
+"""Warp's CPU launches run their threads in a random order, or a part of them alone: a GPU keeps no order.
 
 As a pytest plugin (`python -m pytest -p tests.thread_order`) it is for a process of its own: kernels that were compiled
 before it is installed keep their order, and those compiled after it go to a cache of their own, since the order is no
@@ -15,8 +15,8 @@ import warp._src.codegen as codegen
 
 LOOP = "    for (size_t task_index = 0; task_index < dim->size; ++task_index)\n"
 CALL = "_cpu_kernel_forward<wp_linear_contiguous>(*dim, task_index, _wp_args);"
-ALONE = 2
-"""A launch whose coord_mult is k + ALONE runs the k-th thread alone; Warp itself leaves it at 1."""
+PARTS = 32
+"""A launch whose coord_mult is (n << PARTS) + k runs the k-th of n parts of its threads; Warp itself leaves it at 1."""
 
 # a bijection of [0, n): Feistel rounds over the next power of four, walked until inside
 TASK = """
@@ -40,9 +40,10 @@ static WP_FORCEINLINE size_t {name}_task(size_t i, size_t n)
 }}
 """
 RANGE = f"""    size_t begin = 0, end = dim->size;
-    if (dim->coord_mult >= {ALONE}) {{{{
-        begin = dim->coord_mult - {ALONE};
-        end = begin + 1;
+    const size_t parts = dim->coord_mult >> {PARTS}, part = dim->coord_mult & (((size_t)1 << {PARTS}) - 1);
+    if (parts) {{{{
+        begin = dim->size * part / parts;
+        end = dim->size * (part + 1) / parts;
         dim->coord_mult = 1;
     }}}}
     for (size_t task_index = begin; task_index < end; ++task_index)
