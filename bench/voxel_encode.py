@@ -175,9 +175,8 @@ def bench_first_step(bench: Bench, setting: Setting, inputs: Inputs, counts: Cou
     order = nested_index(points, sample, grids).order
 
     def fused_index() -> list[Tensor]:
-        indexed = fused.index(points, sample)
-        scales = [indexed.scales[grid] for grid in grids]
-        return [indexed.points, scales[0].kept, *indexed.voxel, *(scale.mean for scale in scales)]
+        points_in_order, scales = fused.index(points, sample, batch_size)
+        return [points_in_order, scales.voxels.counts[-1:], *scales.voxels.voxel, *scales.means]
 
     def pick_fused(found: list[Tensor]) -> list[Tensor]:
         kept = int(found[1])
@@ -309,25 +308,24 @@ def twin_stages(setting: Setting, name: str, points: Tensor, voxels: dict[Grid, 
 def fused_stages(setting: Setting, points: Tensor, sample: Tensor) -> Stages:
     """The two steps of FusedEncoder; the points are in the index's order."""
     encoder = setting.fused()
-    indexed = encoder.index(points, sample)
-    feature_grids, projection_grids = setting.encoder.feature_grids, setting.encoder.projection_grids
-    voxels = {grid: int(scale.voxels) for grid, scale in indexed.scales.items()}  # on a GPU arrays are longer
+    indexed = encoder.index(points, sample, 1)
+    index = indexed.scales.voxels
+    voxels = index.counts[:-1].tolist()  # on a GPU arrays are longer
 
     def avfe() -> list[Tensor]:
-        product, maxima = encoder.point_features(indexed)
-        return [product, *maxima]
+        return list(encoder.point_features(indexed))
 
     def avfeo(encoded: list[Tensor]) -> list[Tensor]:
-        return encoder.voxel_features(encoded[0], encoded[1:], indexed, 1, torch.float32)
+        return encoder.voxel_features(encoded[0], encoded[1], indexed, 1, torch.float32)
 
     def pick_encoded(encoded: list[Tensor]) -> list[Tensor]:
-        product, *maxima = encoded
-        maxima = [values[: voxels[grid]] for values, grid in zip(maxima, feature_grids, strict=True)]
+        product, values = encoded
+        maxima = [values[t, : voxels[t]] for t in range(len(values))]
         return flat(list(zip(product.chunk(len(maxima), dim=1), maxima, strict=True)))
 
     def pick_images(images: list[Tensor]) -> list[Tensor]:
         rows = [image.permute(0, 2, 3, 1).flatten(0, 2) for image in images]
-        cursor = [indexed.scales[grid].cursor[: voxels[grid]] for grid in projection_grids]
+        cursor = [index.cursor[s, : voxels[s]] for s in encoder.projected.tolist()]
         return [of_cells[at] for of_cells, at in zip(rows, cursor, strict=True)]
 
     return Stages(avfe, avfeo, pick_encoded=pick_encoded, pick_images=pick_images)

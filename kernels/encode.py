@@ -9,6 +9,7 @@ of its voxel wherever they are needed, and so is the rest in the backward pass. 
 # mypy: disable-error-code="valid-type,attr-defined,no-untyped-def,name-defined,misc,operator,index,arg-type,type-var"
 
 import functools
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -65,34 +66,29 @@ def write_image(features: Tensor, cursor: Tensor, cells: int) -> Tensor:
     return _write_image(features, cursor, cells)
 
 
-class Scale(NamedTuple):
-    """The voxels of one scale in arrays of fixed size, for inference."""
+class Scales(NamedTuple):
+    """The voxels of S nested scales in arrays of fixed size, for inference."""
 
-    voxel: Tensor  # (N,) int64, the voxel of each point
-    starts: Tensor  # int64, where each voxel's points start
-    cursor: Tensor  # int64, cursor of each voxel
-    voxels: Tensor  # (1,) int64, their number, on the device
-    kept: Tensor  # (1,) int64, number of points, on the device
-    mean: Tensor  # (rows, 4) float32, of each voxel's points
+    voxels: NestedIndex
+    means: Tensor  # (S, V, 4) float32, of the points of each voxel
+    rows: list[int]  # of every scale as many voxels or more, known on the host
 
 
-def scales_of(index: NestedIndex, points: Tensor, finest: int) -> tuple[list[Scale], Tensor]:
-    """The scales of an index of points (N, 4) float32, and the points in its order; `finest` is the finest scale.
+def scales_of(index: NestedIndex, points: Tensor, finest: int, cells: Sequence[int]) -> tuple[Scales, Tensor]:
+    """The scales of an index of points (N, 4) float32, and the points in its order.
 
-    On a CPU the counts are at hand and bound the work; for many threads the number of points does, and nothing is read.
+    finest: the finest scale; cells: of the grids of all samples, by scale
+
+    On a CPU the counts are at hand and bound the work; for many threads the numbers of points and of cells do, and
+    nothing is read.
     """
-    scales, capacity, device = len(index.counts) - 1, len(index.order), points.device
-    rows = [capacity] * scales
+    capacity = len(index.order)
+    rows = [min(capacity, most) for most in cells]
     kept = capacity
-    if not many_threads(device):
+    if not many_threads(points.device):
         *rows, kept = index.counts.tolist()
     points = points[index.order[:kept]]
-    counts = index.counts.split(1)
-    means = voxel_means(points, index, finest, max(rows))
-    return [
-        Scale(index.voxel[s], index.starts[s], index.cursor[s], counts[s], counts[scales], means[s, : rows[s]])
-        for s in range(scales)
-    ], points
+    return Scales(index, voxel_means(points, index, finest, max(rows)), rows), points
 
 
 def voxel_means(points: Tensor, index: NestedIndex, finest: int, rows: int) -> Tensor:
@@ -119,68 +115,91 @@ def _chunk_of(device: torch.device) -> int:
 
 
 def encode_voxels(
-    features: Tensor, points: Tensor, weight: Tensor, scale: Scale, relu: bool, product: Tensor, part: int
-) -> Tensor:
-    """`attend` without gradients: writes M to the part-th C columns of product (N, T C), returns G' (rows, C).
+    features: Tensor, points: Tensor, weight: Tensor, scales: Scales, which: Tensor, relu: bool
+) -> tuple[Tensor, Tensor]:
+    """`attend` without gradients, at T scales at once: M (N, T C), side by side, and G' (T, V, C).
 
-    The weight (9, C) is that of g and its bias; the batch norm of the features (N, C) is in them already.
+    which: (T,) int32, the scales
+    weight: (9, C) of g and its bias; the batch norm of the features (N, C) is in them already
     """
-    count = features.shape[1]
-    values = features.new_empty(len(scale.mean), count)
-    column = part * count // lanes_of(count, features.device)
-    _encode(features, points, weight, scale, scale.cursor[:0], relu, product, column, values)
-    return values
+    count, rows = features.shape[1], scales.means.shape[1]
+    product = features.new_empty(len(features), len(which) * count)
+    values = features.new_empty(len(which) * rows, count)
+    _encode(features, points, weight, scales, which, scales.voxels.counts[:0], relu, product, values)
+    return product, values.view(len(which), rows, count)
 
 
-def project_voxels(features: Tensor, points: Tensor, weight: Tensor, scale: Scale, relu: bool, image: Tensor) -> None:
-    """`attend` and Eq. 3 without gradients: writes G' to the cells of the image (B N_L N_W, C), float of any width.
+def project_voxels(
+    features: Tensor,
+    points: Tensor,
+    weight: Tensor,
+    scales: Scales,
+    which: Tensor,
+    first: Tensor,
+    relu: bool,
+    image: Tensor,
+) -> None:
+    """`attend` and Eq. 3 without gradients: writes G' to the cells of images (cells, C), float of any width, which lie
+    one after the other.
 
-    The weight (9, C) is that of g and its bias; the batch norm of the features (N, C) is in them already.
+    which: (T,) int32, their scales; first: (T,) int64, their first cells
+    weight: (9, C) of g and its bias; the batch norm of the features (N, C) is in them already
     """
-    _encode(features, points, weight, scale, scale.cursor, relu, features[:0], 0, image)
+    _encode(features, points, weight, scales, which, first, relu, features[:0], image)
 
 
 def _encode(
     features: Tensor,
     points: Tensor,
     weight: Tensor,
-    scale: Scale,
-    cursor: Tensor,
+    scales: Scales,
+    which: Tensor,
+    first: Tensor,
     relu: bool,
     product: Tensor,
-    column: int,
     values: Tensor,
 ) -> None:
-    """Writes M to the product from a column of vectors on, if it has rows, and G' to the rows of values that the cursor
-    gives, or to those of the voxels if it is empty."""
+    """Writes M to the product, if it has rows, and G' to the rows of values that the cursor gives, from the first of a
+    scale on; without first rows, to those of the voxels (T, V)."""
     count, size = features.shape[1], _chunk_of(features.device)
     lanes, tasks = lanes_of(count, features.device), tasks_of(size, len(points))
-    ends = channels(ends_of(tasks, features), lanes)
-    inputs = [array(scale.starts), array(scale.voxel), array(scale.voxel[:0]), array(scale.kept), array(cursor), size]
-    inputs += [ends, channels(values, lanes)]
-    of_points = [channels(features, lanes), array(points, 4), array(scale.mean, 4), channels(weight, lanes)]
-    of_points += [int(relu), column, channels(product, lanes)]
+    index = scales.voxels
+    ends = channels(features.new_empty(2 * len(which), tasks, count), lanes)
+    inputs = [
+        array(index.starts),
+        array(index.voxel),
+        array(index.counts),
+        array(index.cursor),
+        array(which),
+        array(first),
+    ]
+    inputs += [size, ends, channels(values, lanes)]
+    of_points = [channels(features, lanes), array(points, 4), array(scales.means, 4), channels(weight, lanes)]
+    of_points += [int(relu), channels(product, lanes)]
     kernels = _inference_kernels(lanes, wp.dtype_from_torch(values.dtype))
-    launch(kernels.encode, (tasks, count // lanes), inputs + of_points, features.device)
-    launch(kernels.join, (tasks, count // lanes), inputs, features.device)
+    threads = len(which), tasks, count // lanes
+    launch(kernels.encode, threads, inputs + of_points, features.device)
+    launch(kernels.join, threads, inputs, features.device)
 
 
-def add_of_voxels(features: Tensor, of_voxels: Tensor, voxel: Tensor, kept: Tensor) -> None:
-    """Adds to the features (N, C) of each point the rows of_voxels[t, voxel[t]] (T, V, C) of the voxels it lies in."""
-    rows, count = of_voxels.shape[1:]
+def add_of_voxels(features: Tensor, of_voxels: Tensor, scales: Scales) -> None:
+    """Adds to the features (N, C) of each point the rows (T, V, C) of the voxels of the first T scales it lies in."""
+    scale, rows, count = of_voxels.shape
     lanes = lanes_of(count, features.device)
     # flat: the stride of a third dimension would leave int32 with four million rows
-    inputs = [channels(of_voxels.flatten(0, 1), lanes), rows, array(voxel), array(kept), channels(features, lanes)]
+    inputs = [channels(of_voxels.flatten(0, 1), lanes), rows, scale, array(scales.voxels.voxel)]
+    inputs += [array(scales.voxels.counts), channels(features, lanes)]
     launch(_context_kernel(lanes), (features.shape[0], count // lanes), inputs, features.device)
 
 
-def clear_voxels(image: Tensor, scale: Scale) -> None:
-    """Sets the cells of these voxels of an image (B N_L N_W, C) to zero."""
+def clear_voxels(image: Tensor, scales: Scales, which: Tensor, first: Tensor) -> None:
+    """Sets the cells that `project_voxels` has written to zero."""
     count = image.shape[1]
     lanes = lanes_of(count, image.device)
     kernel = _clear_kernel(lanes, wp.dtype_from_torch(image.dtype))
-    inputs = [array(scale.cursor), array(scale.voxels), channels(image, lanes)]
-    launch(kernel, (len(scale.mean), count // lanes), inputs, image.device)
+    inputs = [array(scales.voxels.cursor), array(scales.voxels.counts), array(which), array(first)]
+    rows = scales.means.shape[1]
+    launch(kernel, (len(which), rows, count // lanes), [*inputs, channels(image, lanes)], image.device)
 
 
 def knowledge(points: Tensor, mean: Tensor, voxel: Tensor) -> Tensor:
@@ -518,37 +537,39 @@ def _inference_kernels(lanes: int, image_dtype: Any) -> SimpleNamespace:
         return narrow
 
     @wp.func
-    def row_of(cursor: wp.array(dtype=wp.int64), v: int):
-        """The row of a voxel in what is written: its cell in an image, or its own number."""
-        row = v
-        if cursor.shape[0] > 0:
-            row = int(cursor[v])
+    def row_of(cursor: wp.array2d(dtype=wp.int64), first: wp.array(dtype=wp.int64), rows: int, t: int, s: int, v: int):
+        """The row of a voxel in what is written: its cell in an image, or its own."""
+        row = t * rows + v
+        if first.shape[0] > 0:
+            row = int(first[t] + cursor[s, v])
         return row
 
     @wp.kernel(enable_backward=False, module=module)
     def encode(
-        starts: wp.array(dtype=wp.int64),
-        voxel: wp.array(dtype=wp.int64),
-        order: wp.array(dtype=wp.int64),
-        kept: wp.array(dtype=wp.int64),
-        cursor: wp.array(dtype=wp.int64),
+        starts: wp.array2d(dtype=wp.int64),
+        voxel: wp.array2d(dtype=wp.int64),
+        counts: wp.array(dtype=wp.int64),
+        cursor: wp.array2d(dtype=wp.int64),
+        which: wp.array(dtype=int),
+        first_row: wp.array(dtype=wp.int64),
         size: int,
         ends: wp.array3d(dtype=vec),
         values: wp.array2d(dtype=pixel),
         features: wp.array2d(dtype=vec),
         points: wp.array(dtype=wp.vec4),
-        mean: wp.array(dtype=wp.vec4),
+        means: wp.array2d(dtype=wp.vec4),
         weight: wp.array2d(dtype=vec),
         relu: int,
-        column: int,
         product: wp.array2d(dtype=vec),
     ):
         """M goes into columns of the product, if there is one; a task has `size` points, and every voxel has some."""
-        task, c = wp.tid()
+        t, task, c = wp.tid()
+        s = which[t]
         first = task * size
-        last = wp.min(first + size, int(kept[0]))
+        last = wp.min(first + size, int(counts[starts.shape[0]]))
         if first >= last:
             return
+        column = t * weight.shape[1] + c
         w0 = weight[0, c]
         w1 = weight[1, c]
         w2 = weight[2, c]
@@ -558,45 +579,47 @@ def _inference_kernels(lanes: int, image_dtype: Any) -> SimpleNamespace:
         w6 = weight[6, c]
         w7 = weight[7, c]
         w8 = weight[8, c]
-        for v in range(int(voxel[first]), int(voxel[last - 1]) + 1):
-            begin, end = int(starts[v]), int(starts[v + 1])
-            centre = mean[v]
+        for v in range(int(voxel[s, first]), int(voxel[s, last - 1]) + 1):
+            begin, end = int(starts[s, v]), int(starts[s, v + 1])
+            centre = means[s, v]
             shared = of_voxel(w4, w5, w6, w7, w8, centre)
             best = vec(-wp.inf)
             for k in range(wp.max(begin, first), wp.min(end, last)):
                 attention = shared + of_point(w0, w1, w2, w3, points[k], centre)
                 row = attended(features[k, c], attention, relu)
                 if product.shape[0] > 0:
-                    product[k, column + c] = row
+                    product[k, column] = row
                 best = wp.max(best, row)
             if begin < first:
-                ends[0, task, c] = best
+                ends[2 * t, task, c] = best
             elif end > last:
-                ends[1, task, c] = best
+                ends[2 * t + 1, task, c] = best
             else:
-                values[row_of(cursor, v), c] = rounded(best)
+                values[row_of(cursor, first_row, values.shape[0] // which.shape[0], t, s, v), c] = rounded(best)
 
     @wp.kernel(enable_backward=False, module=module)
     def join(
-        starts: wp.array(dtype=wp.int64),
-        voxel: wp.array(dtype=wp.int64),
-        order: wp.array(dtype=wp.int64),
-        kept: wp.array(dtype=wp.int64),
-        cursor: wp.array(dtype=wp.int64),
+        starts: wp.array2d(dtype=wp.int64),
+        voxel: wp.array2d(dtype=wp.int64),
+        counts: wp.array(dtype=wp.int64),
+        cursor: wp.array2d(dtype=wp.int64),
+        which: wp.array(dtype=int),
+        first_row: wp.array(dtype=wp.int64),
         size: int,
         ends: wp.array3d(dtype=vec),
         values: wp.array2d(dtype=pixel),
     ):
-        task, c = wp.tid()
-        v = cut_voxel(task, size, int(kept[0]), voxel, order, starts)
+        t, task, c = wp.tid()
+        s = which[t]
+        v = cut_voxel(task, size, int(counts[starts.shape[0]]), voxel[s], voxel[s, 0:0], starts[s])
         if v < 0:
             return
-        best = ends[1, task, c]
+        best = ends[2 * t + 1, task, c]
         k = task + 1
-        while k * size < int(starts[v + 1]):
-            best = wp.max(best, ends[0, k, c])
+        while k * size < int(starts[s, v + 1]):
+            best = wp.max(best, ends[2 * t, k, c])
             k += 1
-        values[row_of(cursor, v), c] = rounded(best)
+        values[row_of(cursor, first_row, values.shape[0] // which.shape[0], t, s, v), c] = rounded(best)
 
     return SimpleNamespace(encode=encode, join=join)
 
@@ -683,16 +706,17 @@ def _context_kernel(lanes: int) -> wp.Kernel:
     def context(
         of_voxels: wp.array2d(dtype=vec),
         rows: int,
+        scales: int,
         voxel: wp.array2d(dtype=wp.int64),
-        kept: wp.array(dtype=wp.int64),
+        counts: wp.array(dtype=wp.int64),
         features: wp.array2d(dtype=vec),
     ):
         """Adds to the features of each point what the voxels that it lies in give, scale after scale."""
         i, c = wp.tid()
-        if wp.int64(i) >= kept[0]:
+        if wp.int64(i) >= counts[voxel.shape[0]]:
             return
         total = features[i, c]
-        for s in range(voxel.shape[0]):
+        for s in range(scales):
             total += of_voxels[s * rows + int(voxel[s, i]), c]
         features[i, c] = total
 
@@ -704,10 +728,17 @@ def _clear_kernel(lanes: int, image_dtype: Any) -> wp.Kernel:
     pixel = wp.types.vector(length=lanes, dtype=image_dtype)
 
     @wp.kernel(enable_backward=False, module=wp.Module(f"hvnet_clear_{image_dtype.__name__}_{lanes}", None))
-    def clear(cursor: wp.array(dtype=wp.int64), counts: wp.array(dtype=wp.int64), image: wp.array2d(dtype=pixel)):
-        voxel, c = wp.tid()
-        if wp.int64(voxel) < counts[0]:
-            image[int(cursor[voxel]), c] = pixel()
+    def clear(
+        cursor: wp.array2d(dtype=wp.int64),
+        counts: wp.array(dtype=wp.int64),
+        which: wp.array(dtype=int),
+        first: wp.array(dtype=wp.int64),
+        image: wp.array2d(dtype=pixel),
+    ):
+        t, v, c = wp.tid()
+        s = which[t]
+        if wp.int64(v) < counts[s]:
+            image[int(first[t] + cursor[s, v]), c] = pixel()
 
     return clear
 

@@ -227,8 +227,8 @@ def _parallel_index(keys: Tensor, of_scales: Tensor, bits: int) -> NestedIndex:
     # one sum over all scales: torch gives a row of a sum along rows to one block of threads alone
     numbers = first.view(-1).cumsum(0, dtype=torch.int32).view_as(first)
     voxel, cursor = (torch.empty(scales, count, dtype=torch.int64, device=keys.device) for _ in range(2))
-    starts = torch.zeros(scales, count + 1, dtype=torch.int64, device=keys.device)
-    counts = torch.zeros(scales + 1, dtype=torch.int64, device=keys.device)
+    zeros = torch.zeros(scales * (count + 1) + scales + 1, dtype=torch.int64, device=keys.device)  # in one launch
+    starts, counts = zeros[: -scales - 1].view(scales, count + 1), zeros[-scales - 1 :]
     inputs = [array(keys), array(of_scales), array(numbers), wp.int64(bits)]
     inputs += [array(tensor) for tensor in (voxel, starts, cursor, counts)]
     launch(_fill_kernel, first.shape, inputs, keys.device)

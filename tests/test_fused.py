@@ -40,12 +40,12 @@ def test_the_two_steps_of_the_fused_encoder_give_its_images() -> None:
     encoder = trained(SMALL)
     fused, parts = FusedEncoder(encoder), FusedEncoder(encoder)
     points, sample = cloud(300)
-    indexed = parts.index(points, sample)
+    indexed = parts.index(points, sample, 2)
     product, maxima = parts.point_features(indexed)
     with torch.no_grad():
         images = parts.voxel_features(product, maxima, indexed, 2, torch.float32)
     assert product.shape == (len(indexed.points), len(SMALL.feature_scales) * SMALL.feature_channels)
-    assert [len(values) for values in maxima] == [len(indexed.scales[grid].mean) for grid in encoder.feature_grids]
+    assert maxima.shape == (len(SMALL.feature_scales), indexed.scales.means.shape[1], SMALL.feature_channels)
     for image, whole in zip(images, fused(points, sample, 2), strict=True):
         assert torch.equal(image, whole)
 

@@ -1,6 +1,7 @@
 """The encoder in inference: the same two steps as in training, with kernels that keep nothing for gradients."""
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -8,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hvnet.kernels.encode import (
-    Scale,
+    Scales,
     add_of_voxels,
     clear_voxels,
     encode_voxels,
@@ -16,7 +17,7 @@ from hvnet.kernels.encode import (
     scales_of,
 )
 from hvnet.kernels.launch import many_threads
-from hvnet.kernels.voxel import Grid, is_nested, nested_index
+from hvnet.kernels.voxel import is_nested, nested_index
 from hvnet.network.encoder import AttentiveVFE, HybridVoxelEncoder, folded
 from hvnet.network.pillars import PillarEncoder
 
@@ -25,8 +26,14 @@ class IndexedPoints(NamedTuple):
     """Points in the order of their voxels, and these voxels at every scale."""
 
     points: Tensor  # (N, 4)
-    voxel: Tensor  # (S, N) int64, the voxel of each point
-    scales: dict[Grid, Scale]
+    scales: Scales
+
+
+class Images(NamedTuple):
+    """The pseudo-images of every projection scale, one after the other."""
+
+    cells: Tensor  # (cells, C)
+    first: Tensor  # (R,) int64, the first cell of every image
 
 
 def is_fused(encoder: HybridVoxelEncoder | PillarEncoder, batch_size: int) -> bool:
@@ -78,68 +85,74 @@ class FusedEncoder:
         halves = context[:-1].chunk(2 * len(self.feature_grids))
         self.of_product, self.of_maxima, self.context_bias = torch.cat(halves[0::2]), halves[1::2], context[-1]
         self.image_knowledge = folded(avfeo.knowledge, avfeo.knowledge_norm, None)
-        self.written: dict[tuple, tuple[Tensor, Scale]] = {}  # every image, and the voxels that were written last
+        device = self.knowledge.device
+        self.encoded = torch.arange(len(self.feature_grids), dtype=torch.int32, device=device)
+        projected = [self.grids.index(grid) for grid in self.projection_grids]
+        self.projected = torch.tensor(projected, dtype=torch.int32, device=device)
+        self.written: dict[tuple, tuple[Images, Scales]] = {}  # images, and the voxels that were written last
 
     @torch.no_grad()
     def __call__(
         self, points: Tensor, sample: Tensor, batch_size: int, dtype: torch.dtype = torch.float32
     ) -> list[Tensor]:
         """As HybridVoxelEncoder in evaluation mode; the images are of the dtype, float32, float16 or bfloat16."""
-        indexed = self.index(points, sample)
+        indexed = self.index(points, sample, batch_size)
         return self.voxel_features(*self.point_features(indexed), indexed, batch_size, dtype)
 
-    def index(self, points: Tensor, sample: Tensor) -> IndexedPoints:
+    def index(self, points: Tensor, sample: Tensor, batch_size: int) -> IndexedPoints:
         """The voxels of points (N, 4) of samples (N,)."""
         index = nested_index(points, sample, self.grids)
-        scales, points = scales_of(index, points, self.finest)
-        return IndexedPoints(points, index.voxel, dict(zip(self.grids, scales, strict=True)))
+        scales, points = scales_of(index, points, self.finest, [batch_size * math.prod(g.shape) for g in self.grids])
+        return IndexedPoints(points, scales)
 
-    def point_features(self, indexed: IndexedPoints) -> tuple[Tensor, list[Tensor]]:
-        """AVFE: M (N, T q) of the T feature scales side by side, and G' (V, q) of each."""
+    def point_features(self, indexed: IndexedPoints) -> tuple[Tensor, Tensor]:
+        """AVFE: M (N, T q) of the T feature scales side by side, and G' (T, V, q)."""
         # not in TF32, which would move a point at 60 m by 3 cm
         features = torch.addmm(self.features_bias, indexed.points, self.of_points)
-        product = features.new_empty(len(features), len(self.feature_grids) * features.shape[1])
-        maxima = [
-            encode_voxels(features, indexed.points, self.knowledge, indexed.scales[grid], self.relu[0], product, t)
-            for t, grid in enumerate(self.feature_grids)
-        ]
-        return product, maxima
+        return encode_voxels(features, indexed.points, self.knowledge, indexed.scales, self.encoded, self.relu[0])
 
     def voxel_features(
-        self, product: Tensor, maxima: list[Tensor], indexed: IndexedPoints, batch_size: int, dtype: torch.dtype
+        self, product: Tensor, maxima: Tensor, indexed: IndexedPoints, batch_size: int, dtype: torch.dtype
     ) -> list[Tensor]:
         """AVFEO and Eq. 3: M and G' of the feature scales to the images (B, N_H, N_L, N_W), finest first."""
-        points = indexed.points
-        scales = [indexed.scales[grid] for grid in self.feature_grids]
+        points, scales = indexed
         with products_in_tf32(points.device):
             context = torch.addmm(self.context_bias, product, self.of_product)
-            of_voxels = context.new_empty(len(scales), max(len(scale.mean) for scale in scales), context.shape[1])
-            for t, (values, weight) in enumerate(zip(maxima, self.of_maxima, strict=True)):
-                torch.mm(values, weight, out=of_voxels[t, : len(values)])
-        add_of_voxels(context, of_voxels, indexed.voxel[: len(scales)], scales[0].kept)
-        images = []
-        for grid in self.projection_grids:
-            scale = indexed.scales[grid]
-            image = self.image(grid, scale, batch_size, context.shape[1], dtype, points.device)
-            project_voxels(context, points, self.image_knowledge, scale, self.relu[1], image)
-            images.append(image.view(batch_size, *grid.shape, -1).permute(0, 3, 1, 2))
-        return images
+            of_voxels = context.new_empty(*maxima.shape[:2], context.shape[1])
+            for t, weight in enumerate(self.of_maxima):
+                torch.mm(maxima[t, : scales.rows[t]], weight, out=of_voxels[t, : scales.rows[t]])
+        add_of_voxels(context, of_voxels, scales)
+        images = self.images(scales, batch_size, context.shape[1], dtype, points.device)
+        project_voxels(
+            context, points, self.image_knowledge, scales, self.projected, images.first, self.relu[1], images.cells
+        )
+        parts = images.cells.split(self.cells(batch_size))
+        return [
+            part.view(batch_size, *grid.shape, -1).permute(0, 3, 1, 2)
+            for part, grid in zip(parts, self.projection_grids, strict=True)
+        ]
 
-    def image(
-        self, grid: Grid, scale: Scale, batch_size: int, channels: int, dtype: torch.dtype, device: torch.device
-    ) -> Tensor:
-        """The image (B N_L N_W, C) of a grid, all zero, to be written at the voxels of the scale."""
-        key = (grid, batch_size, dtype, device)
+    def cells(self, batch_size: int) -> list[int]:
+        """The cells of the image of every projection scale."""
+        return [batch_size * math.prod(grid.shape) for grid in self.projection_grids]
+
+    def images(
+        self, scales: Scales, batch_size: int, channels: int, dtype: torch.dtype, device: torch.device
+    ) -> Images:
+        """The images, all zero, to be written at the voxels of the scales."""
+        key = (batch_size, dtype, device)
         if key in self.written:
-            image, last = self.written[key]
+            images, last = self.written[key]
             if many_threads(device):
-                image.zero_()  # a graph replays what was captured: it would not know the cells written last
+                images.cells.zero_()  # a graph replays what was captured: it would not know the cells written last
             else:
-                clear_voxels(image, last)
+                clear_voxels(images.cells, last, self.projected, images.first)
         else:
-            image = torch.zeros(batch_size * grid.shape[0] * grid.shape[1], channels, dtype=dtype, device=device)
-        self.written[key] = image, scale
-        return image
+            cells = self.cells(batch_size)
+            first = torch.tensor([sum(cells[:k]) for k in range(len(cells))], device=device)
+            images = Images(torch.zeros(sum(cells), channels, dtype=dtype, device=device), first)
+        self.written[key] = images, scales
+        return images
 
 
 def inference(encoder: HybridVoxelEncoder | PillarEncoder) -> Callable[..., list[Tensor]]:
