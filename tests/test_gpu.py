@@ -33,7 +33,7 @@ def rows(encoder: float = 0.09, frame: float = 0.9, step: float = 18.0) -> dict[
         "voxel_encode": [row | {"provider": "hvnet", "median_ms": 7.0}, row],
         "scatter": [row | {"case": "max, 64 channels", "roofline": None}],
         "rotated": [row | {"case": "NMS"}],
-        "detect": [{"config": c, "batch": b, "stage": "detector", "p50_ms": f"{ms}"} for c, b, ms in stages],
+        "detect": [{"config": c, "batch": b, "stage": "whole scan", "p50_ms": f"{ms}"} for c, b, ms in stages],
         "train": [{"config": "hvnet", "batch": 4, "stage": "step", "p50_ms": f"{step}"}],
     }
 
@@ -107,8 +107,8 @@ def test_all_is_well(gpu: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixt
     ("measured", "waits", "names"),
     [
         ({"encoder": 0.11}, 1, ["encoder, inference, the paper's setting"]),
-        ({"frame": 1.5}, 1, ["cloud to boxes, the paper's setting"]),
-        ({"frame": 2.5}, 1, ["cloud to boxes, the paper's setting: at first", "cloud to boxes, the paper's setting"]),
+        ({"frame": 1.5}, 1, ["whole scan to boxes, the paper's setting"]),
+        ({"frame": 2.5}, 1, ["whole scan to boxes, the paper's setting: at first", "cloud to boxes, the paper's setting"]),
         ({"step": 18.2}, 1, ["training, the paper's setting"]),
         ({}, 2.1, ["waits for the device, a step of training"]),
     ],
