@@ -98,7 +98,7 @@ def test_all_is_well(gpu: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixt
     assert "| encoder, inference, the paper's setting | 0.10 ms | 0.09 | holds |" in page
     assert "| tests | 0 | 2 passed, 0 failed, 1 skipped, 1.9 waits |" in page
     assert "| voxel_encode | encoder, forward | hvnet, CUDA graph | 0.09 | 50% |" in page
-    assert "| detect | hvnet, batch 1 | detector | 0.9 |  |" in page
+    assert "| detect | hvnet, batch 1 | whole scan | 0.9 |  |" in page
     assert "Roofs: a copy 4000.0 GB/s, a float32 product 50000.0 GFLOP/s, a TF32 product 300000.0 GFLOP/s." in page
     assert "failed" not in capsys.readouterr().out
 
@@ -108,7 +108,11 @@ def test_all_is_well(gpu: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixt
     [
         ({"encoder": 0.11}, 1, ["encoder, inference, the paper's setting"]),
         ({"frame": 1.5}, 1, ["whole scan to boxes, the paper's setting"]),
-        ({"frame": 2.5}, 1, ["whole scan to boxes, the paper's setting: at first", "cloud to boxes, the paper's setting"]),
+        (
+            {"frame": 2.5},
+            1,
+            ["whole scan to boxes, the paper's setting: at first", "whole scan to boxes, the paper's setting"],
+        ),
         ({"step": 18.2}, 1, ["training, the paper's setting"]),
         ({}, 2.1, ["waits for the device, a step of training"]),
     ],
