@@ -263,19 +263,28 @@ def batched_nms_rotated(
     return merged[scores[merged].argsort(descending=True, stable=True)]
 
 
-def rotated_match(anchors: Tensor, boxes: Tensor, starts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def rotated_match(
+    anchors: Tensor, boxes: Tensor, starts: Tensor, *, labels: Tensor | None = None, classes: int = 1
+) -> tuple[Tensor, Tensor, Tensor]:
     """Pairs anchors (A, 7) with the boxes (M, 7) of every sample b, which are boxes[starts[b]:starts[b + 1]].
+
+    With labels (A,) of the anchors, those of class k see boxes[starts[g]:starts[g + 1]], g = b * classes + k.
 
     Returns each anchor's highest IoU in bird's eye view (B, A) and the index of that box (B, A), and each box's best
     anchor (M,). Ties go to the lowest index; what overlaps nothing has IoU 0 and index -1.
     """
+    if labels is None:
+        labels = torch.zeros(len(anchors), dtype=torch.int64, device=anchors.device)
     iou = rotated_iou_bev(anchors, boxes)  # (A, M)
-    highest = iou.new_zeros(len(starts) - 1, len(anchors))
+    highest = iou.new_zeros((len(starts) - 1) // classes, len(anchors))
     match = torch.full_like(highest, -1, dtype=torch.int64)
-    for sample, (start, end) in enumerate(pairwise(starts.tolist())):
+    for group, (start, end) in enumerate(pairwise(starts.tolist())):
+        sample, seeing = group // classes, labels == group % classes
+        iou[~seeing, start:end] = 0
         if end > start:
-            highest[sample] = iou[:, start:end].amax(1)
-            match[sample] = (iou[:, start:end].argmax(1) + start).where(highest[sample] > 0, -1)  # argmax: the first
+            best_iou, box = iou[seeing, start:end].max(1)  # of equal ones the first
+            highest[sample, seeing] = best_iou
+            match[sample, seeing] = (box + start).where(best_iou > 0, -1)
     best = torch.full((len(boxes),), -1, dtype=torch.int64, device=iou.device)
     if len(anchors):
         best = iou.argmax(0).where(iou.amax(0) > 0, best)

@@ -20,7 +20,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from hvnet.kernels.launch import FLOATS, WARP_FLOAT, array, check_tensor, launch, many_threads
+from hvnet.kernels.launch import FLOATS, WARP_FLOAT, array, check_index, check_tensor, launch, many_threads
 
 WORD = 64  # boxes a word of the NMS mask
 
@@ -171,6 +171,8 @@ def _kernels(dtype: Any) -> SimpleNamespace:
         anchors: wp.array2d(dtype=dtype),
         boxes: wp.array2d(dtype=dtype),
         starts: wp.array(dtype=wp.int64),
+        labels: wp.array(dtype=wp.int64),
+        classes: int,
         iou: wp.array2d(dtype=dtype),
         box: wp.array2d(dtype=wp.int64),
         best: wp.array(dtype=wp.int64),
@@ -178,7 +180,10 @@ def _kernels(dtype: Any) -> SimpleNamespace:
         sample, i = wp.tid()
         highest = zero
         of_highest = int(-1)
-        for j in range(wp.max(int(starts[sample]), 0), wp.min(int(starts[sample + 1]), boxes.shape[0])):
+        group = sample * classes
+        if classes > 1:
+            group += wp.clamp(int(labels[i]), 0, classes - 1)
+        for j in range(wp.max(int(starts[group]), 0), wp.min(int(starts[group + 1]), boxes.shape[0])):
             value = iou_bev(anchors, i, boxes, j)
             if value > highest:
                 highest = value
@@ -321,23 +326,34 @@ def nms_groups(boxes: Tensor, valid: Tensor, counts: Tensor, iou_thresholds: Ten
     )
 
 
-def rotated_match(anchors: Tensor, boxes: Tensor, starts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def rotated_match(
+    anchors: Tensor, boxes: Tensor, starts: Tensor, *, labels: Tensor | None = None, classes: int = 1
+) -> tuple[Tensor, Tensor, Tensor]:
     """Matches anchors (A, 7) to the boxes (M, 7) of B samples by BEV IoU; sample b owns boxes starts[b]:starts[b+1].
+
+    labels: the class of every anchor (A,), int64 in [0, classes), where there are several. Boxes are then in the order
+    of samples and classes, and starts has B * classes + 1 values: an anchor sees starts[g]:starts[g+1] of sample b, g
+    its class + b * classes.
 
     Returns the best IoU of every anchor (B, A), the box that gives it (B, A) int64 (ties: the lowest box; -1: no
     overlap), and the anchor that overlaps each box most (M,) int64 (ties, to the bit of float32: the lowest anchor;
     -1: no overlap). A box that is not finite overlaps nothing. No matrix of anchors times boxes is made.
 
-    Raises TypeError or ValueError naming the argument; on the CPU also for a negative size and for starts that do not
-    ascend from 0 to M. On CUDA nothing is read from the device, so that these are not seen.
+    Raises TypeError or ValueError naming the argument; on the CPU also for a negative size, for a label that is no
+    class, and for starts that do not ascend from 0 to M. On CUDA nothing is read from the device, so that these are not
+    seen.
     """
     _check_pair(anchors, boxes, "anchors", "boxes")
     check_tensor("starts", starts, (torch.int64,), (None,), like=boxes)
     if anchors.shape[0] >= 2**31:
         raise ValueError(f"anchors: want fewer than 2^31, got {anchors.shape[0]}")
-    if starts.shape[0] == 0:
-        raise ValueError(f"starts: want ascending values from 0 to {boxes.shape[0]}, got []")
-    return _match(anchors.detach(), boxes.detach(), starts)
+    if classes < 1 or (classes > 1 and labels is None):
+        raise ValueError(f"classes: want 1, or with labels 1 or more, got {classes}")
+    if labels is not None:
+        check_tensor("labels", labels, (torch.int64,), (anchors.shape[0],), like=boxes)
+    if starts.shape[0] == 0 or (starts.shape[0] - 1) % classes:
+        raise ValueError(f"starts: want {classes} for every sample and one more, got {starts.shape[0]}")
+    return _match(anchors.detach(), boxes.detach(), starts, labels, classes)
 
 
 def box_iou_rotated(a: Tensor, b: Tensor, *, degrees: bool = True) -> Tensor:
@@ -541,24 +557,31 @@ def _nms_groups(boxes: Tensor, valid: Tensor, counts: Tensor, iou_thresholds: Te
 _nms_groups.register_fake(_nms_groups_outputs)
 
 
-def _match_outputs(anchors: Tensor, boxes: Tensor, starts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    shape = (starts.shape[0] - 1, anchors.shape[0])
+def _match_outputs(
+    anchors: Tensor, boxes: Tensor, starts: Tensor, labels: Tensor | None, classes: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    shape = ((starts.shape[0] - 1) // classes, anchors.shape[0])
     iou, match = anchors.new_empty(shape), anchors.new_empty(shape, dtype=torch.int64)
     return iou, match, anchors.new_empty(boxes.shape[0], dtype=torch.int64)
 
 
 @torch.library.custom_op("hvnet::rotated_match", mutates_args=())
-def _match(anchors: Tensor, boxes: Tensor, starts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _match(
+    anchors: Tensor, boxes: Tensor, starts: Tensor, labels: Tensor | None, classes: int
+) -> tuple[Tensor, Tensor, Tensor]:
     if not many_threads(boxes.device):  # the checks read the device
         ends = starts.tolist()
         if ends[0] != 0 or ends[-1] != len(boxes) or any(end < start for start, end in pairwise(ends)):
             raise ValueError(f"starts: want ascending values from 0 to {len(boxes)}, got {ends}")
         _check_sizes("anchors", anchors)
         _check_sizes("boxes", boxes)
-    iou, match, best = _match_outputs(anchors, boxes, starts)
+        if labels is not None:
+            check_index("labels", labels, classes)
+    iou, match, best = _match_outputs(anchors, boxes, starts, labels, classes)
     best.fill_(-1)
-    inputs = [array(t.contiguous()) for t in (anchors, boxes, starts)] + [array(iou), array(match), array(best)]
-    launch(_kernels(WARP_FLOAT[anchors.dtype]).match, iou.shape, inputs, anchors.device)
+    inputs = [array(t.contiguous()) for t in (anchors, boxes, starts, starts[:0] if labels is None else labels)]
+    outputs = [array(iou), array(match), array(best)]
+    launch(_kernels(WARP_FLOAT[anchors.dtype]).match, iou.shape, [*inputs, classes, *outputs], anchors.device)
     best.copy_(torch.where(best < 0, best, 0x7FFFFFFF - (best & 0x7FFFFFFF)))  # from keys to anchors
     return iou, match, best
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from hvnet.config import Config, config_to_dict, load_config
+from hvnet.network.anchors import Anchors, Targets, assign_targets
 from hvnet.network.checkpoint import save_checkpoint
 from hvnet.network.model import HVNet
 
@@ -36,6 +37,20 @@ SHORT = [
     "train.pictures=1",
 ]
 """A run of seconds, of the demo's config."""
+
+
+def match_class(
+    anchors: Tensor,
+    boxes: Sequence[Tensor],
+    positive_iou: float,
+    negative_iou: float,
+    regression: str = "corners",
+) -> Targets:
+    """Targets of anchors (A, 7) for the boxes (M_b, 7) of every sample, all of one class."""
+    entry = load_config(CONFIGS / "demo.yaml").head.classes[0]
+    entry = dataclasses.replace(entry, positive_iou=positive_iou, negative_iou=negative_iou)
+    labels = [torch.zeros(len(own), dtype=torch.int64) for own in boxes]
+    return assign_targets(Anchors([anchors], [entry]), boxes, labels, regression)
 
 
 def save_untrained(path: Path, changes: Sequence[str], seed: int = 0) -> None:

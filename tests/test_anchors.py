@@ -14,13 +14,14 @@ from hvnet.network.anchors import (
     MAX_HEIGHT,
     MAX_SHIFT,
     MAX_SIZE,
+    Anchors,
     assign_targets,
-    boxes_of_class,
     decode,
     encode,
     make_anchors,
     positives_per_box,
 )
+from tests.models import match_class
 
 
 def any_boxes(count: int, seed: int = 0) -> Tensor:
@@ -155,18 +156,18 @@ def test_assign_targets_by_hand(threads: None) -> None:
     anchors = torch.tensor([[x, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0] for x in (0.0, 1.0, 2.0, 10.0, 20.0)])
     boxes = torch.tensor([[0.4, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], [13.9, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]])
     # IoU with box 0, shifted by d: (4 - d) / (4 + d): 0.818, 0.739, 0.429, 0, 0; box 1 overlaps only anchor 3: 0.013
-    targets = assign_targets(anchors, [boxes, boxes[:0]], 0.75, 0.6)
+    targets = match_class(anchors, [boxes, boxes[:0]], 0.75, 0.6)
     assert targets.positive.tolist() == [[True, False, False, True, False], [False] * 5]
     assert targets.negative.tolist() == [[False, False, True, False, True], [True] * 5]
     torch.testing.assert_close(targets.location[~targets.unused], torch.tensor([[0.4, 0.0] * 4, [3.9, 0.0] * 4]))
-    assert targets.rows[~targets.unused].tolist() == [0, 3]
+    assert targets.rows[0][~targets.unused].tolist() == [0, 3]
     assert targets.boxes[~targets.unused].tolist() == boxes.tolist()
 
 
 def test_two_boxes_with_one_best_anchor(threads: None) -> None:
     anchors = torch.tensor([[0.0, 0, 0, 4, 2, 1.5, 0], [50.0, 0, 0, 4, 2, 1.5, 0]])
     boxes = torch.tensor([[1.0, 0, 0, 4, 2, 1.5, 0], [0.5, 0, 0, 4, 2, 1.5, 0]])
-    targets = assign_targets(anchors, [boxes], 0.9, 0.3)
+    targets = match_class(anchors, [boxes], 0.9, 0.3)
     assert targets.positive.tolist() == [[True, False]]
     torch.testing.assert_close(targets.location[~targets.unused], torch.tensor([[1.0, 0.0] * 4]))
 
@@ -176,7 +177,7 @@ def test_assign_targets_is_the_matrix_version(demo: Config, threads: None) -> No
     anchors = make_anchors(demo, entry)
     boxes = any_boxes(6)
     boxes[:, :2] = torch.tensor([[2.0, 0.0], [4.0, 2.0], [8.0, -2.0], [10.0, 1.0], [6.0, 0.0], [11.0, -1.0]])
-    targets = assign_targets(anchors, [boxes[:4], boxes[4:]], 0.5, 0.35)
+    targets = match_class(anchors, [boxes[:4], boxes[4:]], 0.5, 0.35)
     for b, own in enumerate((boxes[:4], boxes[4:])):
         iou = reference.rotated_iou_bev(anchors.double(), own.double())
         near = ((iou - 0.5).abs() < 1e-5).any(1) | ((iou - 0.35).abs() < 1e-5).any(1)
@@ -191,34 +192,61 @@ def test_assign_targets_is_the_matrix_version(demo: Config, threads: None) -> No
             assert targets.positive[b][iou[:, m] > iou[:, m].amax() - 1e-6].any()
 
 
+def boxes_of_classes(demo: Config) -> tuple[list[Tensor], list[Tensor]]:
+    """Boxes of three samples, some of no class; the second sample has none."""
+    sizes = torch.tensor([each.anchor_sizes[0] for each in demo.head.classes] * 2)
+    boxes = [any_boxes(24, seed) * torch.tensor([0.2, 0.1, 1, 1, 1, 1, 1]) for seed in range(3)]
+    labels = [torch.arange(24) % 4 - 1 for _ in boxes]
+    for own, of_own in zip(boxes, labels, strict=True):
+        own[:, 3:6] = sizes[of_own] * (0.9 + 0.02 * own[:, 3:6])
+    return [boxes[0], boxes[1][:0], boxes[2]], [labels[0], labels[1][:0], labels[2]]
+
+
+def test_targets_of_classes_are_those_of_each_alone(demo: Config, threads: None) -> None:
+    """The same bits, class after class."""
+    classes, (boxes, labels) = demo.head.classes, boxes_of_classes(demo)
+    grids = [make_anchors(demo, entry) for entry in classes]
+    anchors = Anchors(grids, classes, [positives_per_box(demo, entry) for entry in classes])
+    joint = assign_targets(anchors, boxes, labels)
+    positive, negative = (mask.split(anchors.counts, dim=1) for mask in joint[:2])
+    used = [~unused for unused in joint.unused.split([len(rows) for rows in joint.rows])]
+    of_rows = [values.split([len(rows) for rows in joint.rows]) for values in joint[4:]]
+    for k, entry in enumerate(classes):
+        assert torch.equal(anchors(k), grids[k])
+        own = [each[of_each == k] for each, of_each in zip(boxes, labels, strict=True)]
+        alone = match_class(grids[k], own, entry.positive_iou, entry.negative_iou)
+        assert torch.equal(positive[k], alone.positive)
+        assert torch.equal(negative[k], alone.negative)
+        assert torch.equal(joint.rows[k][used[k]], alone.rows[0][~alone.unused])
+        assert used[k].sum() > 5
+        for values, want in zip(of_rows, alone[4:], strict=True):
+            assert torch.equal(values[k][used[k]], want[~alone.unused])
+
+
 @pytest.mark.parametrize("regression", ["corners", "pose"])
 def test_targets_of_many_threads_are_those_of_one(
     demo: Config, regression: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same bits in the rows that are used; the others are different anchors, matched to themselves."""
-    anchors, entry = make_anchors(demo, demo.head.classes[0]), demo.head.classes[0]
-    boxes = [any_boxes(12, seed) * torch.tensor([0.2, 0.1, 1, 1, 1, 1, 1]) for seed in range(3)]
-    boxes[1] = boxes[1][:0]
-    labels = [torch.arange(len(own)) % 3 - 1 for own in boxes]
-
-    def targets() -> tuple[Tensor, ...]:
-        own, most = boxes_of_class(boxes, labels, 0), positives_per_box(demo, entry)
-        return assign_targets(anchors, own, entry.positive_iou, entry.negative_iou, regression, most)
-
-    one = targets()
+    classes, (boxes, labels) = demo.head.classes, boxes_of_classes(demo)
+    per_box = [positives_per_box(demo, entry) for entry in classes]
+    anchors = Anchors([make_anchors(demo, entry) for entry in classes], classes, per_box)
+    one = assign_targets(anchors, boxes, labels, regression)
     monkeypatch.setattr("hvnet.kernels.launch.force_many_threads", True)
-    many = targets()
-    used = ~many[3]
-    assert torch.equal(one[0], many[0])
-    assert torch.equal(one[1], many[1])
+    many = assign_targets(anchors, boxes, labels, regression)
+    used = ~many.unused
+    assert torch.equal(one.positive, many.positive)
+    assert torch.equal(one.negative, many.negative)
     assert 0 < used.sum() < len(used)
-    assert not one[3].any()
-    for a, b in zip(one[2:], many[2:], strict=True):
-        assert torch.equal(a, b[used])
-    assert many[2][~used].unique().shape == many[2][~used].shape
-    for values in many[4:7]:
+    assert not one.unused.any()
+    for rows, want, of_class in zip(many.rows, one.rows, used.split([len(rows) for rows in many.rows]), strict=True):
+        assert torch.equal(rows[of_class], want)
+        assert rows[~of_class].unique().shape == rows[~of_class].shape
+    for values, want in zip(many[4:], one[4:], strict=True):
+        assert torch.equal(values[used], want)
+    for values in (many.location, many.vertical, many.direction):
         assert not values[~used].any()
-    assert torch.equal(many[7][~used], many[8][~used])
+    assert torch.equal(many.anchors[~used], many.boxes[~used])
 
 
 @pytest.mark.parametrize("positive_iou", [0.25, 0.35, 0.5, 0.7])
@@ -231,5 +259,5 @@ def test_no_box_has_more_positive_anchors(demo: Config, positive_iou: float, thr
     boxes[:, :2] += (torch.rand(600, 2, generator=generator) - 0.5) * 0.4
     boxes[300:, 3:5] *= 4 ** (2 * torch.rand(300, 2, generator=generator) - 1)
     boxes[:, 6] = torch.rand(600, generator=generator) * math.pi
-    positive = assign_targets(anchors, list(boxes[:, None]), positive_iou, 0.05).positive.sum(dim=1)
+    positive = match_class(anchors, list(boxes[:, None]), positive_iou, 0.05).positive.sum(dim=1)
     assert most / 20 < positive.max() <= most

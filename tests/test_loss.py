@@ -9,11 +9,10 @@ from torch import Tensor
 
 from hvnet.config import Config, LossConfig, load_config
 from hvnet.kernels.rotated import rotated_iou_bev
-from hvnet.network.anchors import assign_targets
 from hvnet.network.head import LOCATION_VALUES, HeadMaps
-from hvnet.network.loss import class_loss, focal_loss, iou_pairs
+from hvnet.network.loss import focal_loss, iou_pairs, total_loss
 from hvnet.network.model import HVNet
-from tests.models import CONFIGS, some_points
+from tests.models import CONFIGS, match_class, some_points
 
 
 def box(x: float, y: float, l: float, w: float, yaw: float = 0.0) -> Tensor:
@@ -75,19 +74,19 @@ def test_iou_losses_of_a_class_by_hand(threads: None) -> None:
     """One positive anchor: 1 - IoU = 2/5, 1 - GIoU, and the branch, whose target is the IoU of 3/5."""
     entry = load_config(CONFIGS / "demo.yaml").head.classes[0]
     anchors = torch.tensor([[0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], [50.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]])
-    targets = assign_targets(anchors, [torch.tensor([[1.0, 1.0, 0.0, 4.0, 2.0, 1.5, 0.0]])], 0.2, 0.1)
+    targets = match_class(anchors, [torch.tensor([[1.0, 1.0, 0.0, 4.0, 2.0, 1.5, 0.0]])], 0.2, 0.1)
     assert targets.positive.tolist() == [[True, False]]
     location = torch.zeros(1, 2, 8)
     location[..., 0::2] = 1.0
     location[..., 1::2] = 0.5  # the box stands at (1, 0.5): 4 x 1.5 of 4 x 2.5 are shared
     maps = HeadMaps(torch.zeros(1, 2), location, torch.zeros(1, 2, 2), None, torch.tensor([[2.0, -3.0]]))
     weights = LossConfig(localization=2.0, iou=3.0)
-    terms = class_loss(maps, targets, entry, dataclasses.replace(weights, box="iou"))
+    terms = total_loss([maps], targets, [entry], dataclasses.replace(weights, box="iou"))
     assert terms["localization"].item() == pytest.approx(2.0 * (1 - 6 / 10), abs=1e-5)
     branch = math.log(1 + math.exp(2.0)) - 2.0 * 6 / 10  # cross-entropy of the logit 2 with the target 0.6
     assert terms["iou"].item() == pytest.approx(3.0 * branch, abs=1e-5)
     location[..., 0::2] = 3.0  # at (3, 0.5): 2 x 1.5 shared, 13 covered, 6 x 2.5 enclosed
-    terms = class_loss(maps, targets, entry, dataclasses.replace(weights, box="giou"))
+    terms = total_loss([maps], targets, [entry], dataclasses.replace(weights, box="giou"))
     assert terms["localization"].item() == pytest.approx(2.0 * (1 - (3 / 13 - 2 / 15)), abs=1e-5)
 
 
@@ -124,18 +123,18 @@ def test_focal_loss_by_hand() -> None:
     assert focal_loss(logits, positive, negative, 0.25, 2.0).item() == pytest.approx(expected, rel=1e-6)
 
 
-def test_class_loss_by_hand(demo: Config, threads: None) -> None:
+def test_loss_of_a_class_by_hand(demo: Config, threads: None) -> None:
     entry = dataclasses.replace(demo.head.classes[0], focal_gamma=0.0, focal_alpha=0.5)
     anchors = torch.tensor([[0.0, 0, 0, 4, 2, 1.5, 0], [0.1, 0, 0, 4, 2, 1.5, 0], [50.0, 0, 0, 4, 2, 1.5, 0]])
-    targets = assign_targets(anchors, [torch.tensor([[0.0, 0, 0.3, 4, 2, 1.5, 0]])], 0.5, 0.35)
+    targets = match_class(anchors, [torch.tensor([[0.0, 0, 0.3, 4, 2, 1.5, 0]])], 0.5, 0.35)
     assert targets.positive.tolist() == [[True, True, False]]
     maps = HeadMaps(torch.zeros(1, 3), torch.zeros(1, 3, 8), torch.zeros(1, 3, 2), torch.zeros(1, 3, 2))
-    terms = class_loss(maps, targets, entry, LossConfig())
+    terms = total_loss([maps], targets, [entry], LossConfig())
     assert terms["classification"].item() == pytest.approx(3 * 0.5 * math.log(2) / 2)
     assert terms["localization"].item() == pytest.approx(4 * 0.5 * 0.1**2 / 2)  # four x offsets of -0.1 m
     assert terms["vertical"].item() == pytest.approx(1.5 * 2 * 0.5 * 0.2**2 / 2)
     assert terms["direction"].item() == pytest.approx(0.2 * math.log(2))
-    terms = class_loss(maps, targets, entry, LossConfig(beta=0.05))  # from 0.05 on linear
+    terms = total_loss([maps], targets, [entry], LossConfig(beta=0.05))  # from 0.05 on linear
     assert terms["localization"].item() == pytest.approx(4 * (0.1 - 0.025) / 2)
     assert terms["vertical"].item() == pytest.approx(1.5 * 2 * (0.2 - 0.025) / 2)
 
@@ -150,15 +149,10 @@ def test_loss_without_boxes_is_finite(demo: Config, threads: None) -> None:
     assert terms["localization"] == 0
 
 
-@pytest.mark.parametrize("box", ["smooth_l1", "iou", "giou"])
-@pytest.mark.parametrize("regression", ["corners", "pose"])
-def test_losses_of_many_threads_are_those_of_one(
-    box: str, regression: str, demo: Config, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Every term, and the gradients of every map, though there is no number at all where no anchor is positive."""
+def losses_of(demo: Config, box: str, regression: str) -> tuple[HVNet, list[list[Tensor]], list[Tensor], list[Tensor]]:
+    """A model with every term, maps of three samples class by class, and their boxes and labels."""
     head = dataclasses.replace(demo.head, direction=True, iou=True, regression=regression)
-    config = dataclasses.replace(demo, head=head, loss=dataclasses.replace(demo.loss, box=box))
-    model = HVNet(config)
+    model = HVNet(dataclasses.replace(demo, head=head, loss=dataclasses.replace(demo.loss, box=box)))
     generator = torch.Generator().manual_seed(0)
     boxes = [torch.cat([model.anchors(k)[5 * b + 40 :: 60][:4] for k in range(3)]) for b in range(3)]
     for own in boxes:
@@ -169,6 +163,39 @@ def test_losses_of_many_threads_are_those_of_one(
     for k in range(3):
         shapes = [(3, len(model.anchors(k)), *of_anchor) for of_anchor in of_anchors]
         maps.append([torch.randn(shape, generator=generator) * 0.1 for shape in shapes])
+    return model, maps, boxes, labels
+
+
+@pytest.mark.parametrize("box", ["smooth_l1", "iou", "giou"])
+@pytest.mark.parametrize("regression", ["corners", "pose"])
+def test_losses_are_the_sums_of_those_of_the_classes(box: str, regression: str, demo: Config) -> None:
+    """The same bits, and those of the gradients, as of one class after the other; the second one has no box."""
+    model, maps, boxes, labels = losses_of(demo, box, regression)
+    labels = [of_own.where(of_own != 1, -1) for of_own in labels]
+    leaves = [[part.requires_grad_() for part in of_class] for of_class in maps]
+    found = model.loss([HeadMaps(*of_class) for of_class in leaves], boxes, labels)
+    want: dict[str, Tensor] = {}
+    for k, entry in enumerate(demo.head.classes):
+        own = [each[of_each == k] for each, of_each in zip(boxes, labels, strict=True)]
+        thresholds = (entry.positive_iou, entry.negative_iou)
+        targets = match_class(model.anchors(k), own, *thresholds, regression=regression)
+        terms = total_loss([HeadMaps(*leaves[k])], targets, [entry], model.config.loss)
+        want = {name: want[name] + term if want else term for name, term in terms.items()}
+    assert found == want
+    assert all(term > 0 for term in found.values())
+    flat = [part for of_class in leaves for part in of_class]
+    gradients = (torch.autograd.grad(torch.stack(list(terms.values())).sum(), flat) for terms in (found, want))
+    for mine, of_classes in zip(*gradients, strict=True):
+        assert torch.equal(mine, of_classes)
+
+
+@pytest.mark.parametrize("box", ["smooth_l1", "iou", "giou"])
+@pytest.mark.parametrize("regression", ["corners", "pose"])
+def test_losses_of_many_threads_are_those_of_one(
+    box: str, regression: str, demo: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every term, and the gradients of every map, though there is no number at all where no anchor is positive."""
+    model, maps, boxes, labels = losses_of(demo, box, regression)
 
     def terms_and_gradients() -> tuple[dict[str, Tensor], list[Tensor]]:
         leaves = [part.clone().requires_grad_() for of_class in maps for part in of_class]

@@ -385,12 +385,42 @@ def test_match_of_boxes_that_are_not_finite(device: torch.device, threads: None)
     assert (found[2][0::2] == -1).all()
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_match_of_classes(dtype: torch.dtype, device: torch.device, threads: None) -> None:
+    """What each class has alone, and what the twin says; a class without anchors, and one without boxes."""
+    anchors, boxes = random_boxes(600, 14, 12).to(dtype), random_boxes(40, 15, 12).to(dtype)
+    labels, starts = torch.arange(600) % 3 * 2 % 5, torch.tensor([0, 8, 12, 12, 15, 20, 20, 26, 27, 30, 40])
+    given = (anchors.to(device), boxes.to(device), starts.to(device))
+    iou, match, best = rotated.rotated_match(*given, labels=labels.to(device), classes=5)
+    expected = reference.rotated_match(anchors.double(), boxes.double(), starts, labels=labels, classes=5)
+    equals(iou, expected[0], TOLERANCE[dtype])
+    assert torch.equal(match.cpu(), expected[1])
+    assert torch.equal(best.cpu(), expected[2])
+    for sample in range(2):
+        for k in range(5):
+            of_class, (start, end) = labels == k, starts[5 * sample + k :][:2].tolist()
+            alone = rotated.rotated_match(
+                anchors[of_class].to(device), boxes[start:end].to(device), torch.tensor([0, end - start], device=device)
+            )
+            assert torch.equal(iou[sample, of_class], alone[0][0])
+            assert torch.equal(match[sample, of_class], torch.where(alone[1][0] < 0, -1, alone[1][0] + start))
+            rows = of_class.nonzero()[:, 0].to(device)
+            none = best[start:end] < 0
+            assert torch.equal(none, alone[2] < 0)
+            assert torch.equal(best[start:end][~none], rows[alone[2][~none]])
+
+
 def test_match_reads_no_box_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
     """Many threads check no start, because that would read the device."""
     monkeypatch.setattr("hvnet.kernels.launch.force_many_threads", True)
     anchors, boxes = random_boxes(20, 16, 4), random_boxes(3, 17, 4)
     expected = rotated.rotated_match(anchors, boxes, torch.tensor([0, 3]))
     found = rotated.rotated_match(anchors, boxes, torch.tensor([-(2**30), 2**30]))
+    for mine, want in zip(found, expected, strict=True):
+        assert torch.equal(mine, want)
+    starts, labels = torch.tensor([0, 0, 3]), torch.arange(20) % 2
+    expected = rotated.rotated_match(anchors, boxes, starts, labels=labels, classes=2)
+    found = rotated.rotated_match(anchors, boxes, starts, labels=labels * 2**20 - 1, classes=2)
     for mine, want in zip(found, expected, strict=True):
         assert torch.equal(mine, want)
 
@@ -470,6 +500,19 @@ def test_bad_match() -> None:
     for wrong in ([0, 1], [1, 2], [0, 2, 1, 2], [0, 3], []):
         with pytest.raises(ValueError, match="starts"):
             rotated.rotated_match(anchors, boxes, torch.tensor(wrong, dtype=torch.int64))
+    labels = torch.tensor([0, 1, 1])
+    with pytest.raises(ValueError, match=r"starts.*2.*got 4"):
+        rotated.rotated_match(anchors, boxes, torch.tensor([0, 0, 1, 2]), labels=labels, classes=2)
+    for classes in (0, 2):
+        with pytest.raises(ValueError, match=rf"classes.*{classes}"):
+            rotated.rotated_match(anchors, boxes, starts, classes=classes)
+    with pytest.raises(TypeError, match=r"labels.*int32"):
+        rotated.rotated_match(anchors, boxes, starts, labels=labels.int(), classes=2)
+    with pytest.raises(ValueError, match="labels"):
+        rotated.rotated_match(anchors, boxes, starts, labels=labels[:2], classes=2)
+    for wrong in (-1, 2):
+        with pytest.raises((ValueError, IndexError), match=rf"labels.*{wrong}"):
+            rotated.rotated_match(anchors, boxes, starts, labels=labels * wrong, classes=2)
 
 
 def test_bad_threshold() -> None:
@@ -730,7 +773,8 @@ def test_opcheck(dtype: torch.dtype, device: torch.device) -> None:
         (ops.rotated_nms, (a, scores, None, 0.3)),
         (ops.rotated_nms, (a, scores, group, 0.3)),
         (ops.nms_groups, (a.view(2, 3, 7), *groups_of(2, 3, dtype, device))),
-        (ops.rotated_match, (a, b, torch.tensor([0, 2, 5], device=device))),
+        (ops.rotated_match, (a, b, torch.tensor([0, 2, 5], device=device), None, 1)),
+        (ops.rotated_match, (a, b, torch.tensor([0, 2, 5], device=device), torch.arange(len(a), device=device) % 2, 2)),
     ):
         torch.library.opcheck(op, arguments)
 
@@ -757,7 +801,13 @@ def compiled_cases() -> dict[str, tuple[Callable[..., object], Callable[[int], t
             rotated.nms_groups,
             lambda n: (boxes(2 * n).view(2, n, 7), *groups_of(2, n, torch.float32)),
         ),
-        "rotated_match": (rotated.rotated_match, lambda n: (boxes(n + 7), boxes(n), torch.tensor([0, 3, n]))),
+        "rotated_match": (
+            lambda a, b, starts, labels: (
+                *rotated.rotated_match(a, b, starts),
+                *rotated.rotated_match(a, b, starts, labels=labels, classes=2),
+            ),
+            lambda n: (boxes(n + 7), boxes(n), torch.tensor([0, 3, n]), torch.arange(n + 7) % 2),
+        ),
         "box_iou_rotated": (rotated.box_iou_rotated, lambda n: (in_image(n)[0], in_image(n + 1)[0])),
         "nms_rotated": (lambda b, s, _: rotated.nms_rotated(b, s, 0.2), in_image),
         "batched_nms_rotated": (lambda b, s, i: rotated.batched_nms_rotated(b, s, i, 0.2, degrees=False), in_image),

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
 from hvnet.boxes import bev_corners, limit_angle
@@ -29,8 +29,38 @@ MAX_OUTPUT = 50.0
 """Bound of the outputs that are logarithms or radians: exp(50) is finite."""
 
 
+class Anchors(nn.Module):
+    """The A anchors of all classes, class after class, and what matching asks of each; called with a label, its own."""
+
+    boxes: Tensor  # (A, 7)
+    labels: Tensor  # (A,) int64
+    positive_iou: Tensor  # (A,)
+    negative_iou: Tensor  # (A,)
+
+    def __init__(
+        self, boxes: Sequence[Tensor], classes: Sequence[ClassConfig], per_box: Sequence[int] | None = None
+    ) -> None:
+        """Anchors (A_k, 7) of every class. per_box is what `positives_per_box` gives for each; without it many threads
+        have a row for every anchor."""
+        super().__init__()
+        self.counts, self.per_box = [len(own) for own in boxes], per_box
+
+        def of_anchors(values: Sequence[float]) -> Tensor:
+            return torch.cat([torch.full((count,), x) for count, x in zip(self.counts, values, strict=True)])
+
+        self.register_buffer("boxes", torch.cat(list(boxes)), persistent=False)
+        self.register_buffer("labels", of_anchors(range(len(classes))), persistent=False)
+        for name in ("positive_iou", "negative_iou"):
+            self.register_buffer(name, of_anchors([getattr(entry, name) for entry in classes]), persistent=False)
+
+    def forward(self, label: int) -> Tensor:
+        """Anchors (A_k, 7) of a class."""
+        return self.boxes.split(self.counts)[label]
+
+
 class Targets(NamedTuple):
-    """Targets of the anchors of one class over a batch, and P rows for the positive ones, in the order of nonzero().
+    """Targets of the A anchors of all classes over a batch, and P rows for the positive ones, class after class, and
+    within a class in the order of nonzero().
 
     One thread has as many rows as positive anchors. Many threads read no number from the device: they have as many rows
     as there can be, and the unused ones are anchors matched to themselves, whose targets are 0.
@@ -38,7 +68,7 @@ class Targets(NamedTuple):
 
     positive: Tensor  # (B, A) bool
     negative: Tensor  # (B, A) bool; anchors that are neither are ignored
-    rows: Tensor  # (P,) int64, indices into the B * A anchors
+    rows: tuple[Tensor, ...]  # of every class: (P_k,) int64, indices into the B * A_k anchors of its maps
     unused: Tensor  # (P,) bool
     location: Tensor  # (P, 8) metres, or (P, 5)
     vertical: Tensor  # (P, 2)
@@ -152,52 +182,49 @@ def positives_per_box(config: Config, entry: ClassConfig) -> int:
     return count
 
 
-def boxes_of_class(boxes: Sequence[Tensor], labels: Sequence[Tensor], label: int) -> list[Tensor]:
-    """The boxes (M_b, 7) of every sample that have the label.
-
-    Many threads, which read no number from the device, leave rows of NaN for the others: they match nothing.
-    """
-    if many_threads(boxes[0].device):
-        others = torch.cat(list(labels)) != label
-        sizes = [len(own) for own in boxes]
-        return list(torch.cat(list(boxes)).masked_fill(others[:, None], math.nan).split(sizes))
-    return [own[of_own == label] for own, of_own in zip(boxes, labels, strict=True)]
-
-
 def assign_targets(
-    anchors: Tensor,
-    boxes: Sequence[Tensor],
-    positive_iou: float,
-    negative_iou: float,
-    regression: str = "corners",
-    per_box: int | None = None,
+    anchors: Anchors, boxes: Sequence[Tensor], labels: Sequence[Tensor], regression: str = "corners"
 ) -> Targets:
-    """Matches anchors (A, 7) of a class to its boxes, one (M_b, 7) a sample, by rotated IoU in bird's eye view.
+    """Matches anchors to the boxes (M_b, 7) of their class in every sample, by rotated IoU in bird's eye view.
 
-    Positive: IoU above positive_iou, or the best anchor of a box (if it overlaps at all; of two boxes with one best
-    anchor the first has it). Negative: IoU below negative_iou. per_box is what `positives_per_box` gives; without it
-    many threads have a row for every anchor.
+    labels: (M_b,) int64 a sample; boxes of no class match nothing.
+
+    Positive: IoU above the class's positive_iou, or the best anchor of a box (if it overlaps at all; of two boxes with
+    one best anchor the first has it). Negative: IoU below its negative_iou.
     """
-    device = anchors.device
-    every = pad_sequence(list(boxes), batch_first=True, padding_value=math.nan)  # (B, M, 7)
-    samples = torch.arange(len(every) + 1, device=device)
-    count = every.shape[0] * every.shape[1]
-    iou, match, best = rotated_match(anchors, every.view(-1, 7), samples * every.shape[1])
+    device, in_sample, groups = anchors.boxes.device, len(anchors.boxes), len(anchors.counts) + 1
+    # the boxes of a sample, class after class; the last group is of no class
+    padded = pad_sequence(list(boxes), batch_first=True, padding_value=math.nan)  # (B, M, 7)
+    group = pad_sequence(list(labels), batch_first=True, padding_value=-1).clamp(-1, groups - 1) % groups
+    group = group + groups * torch.arange(len(group), device=device)[:, None]
+    group, order = group.flatten().sort(stable=True)
+    every, count = padded.view(-1, 7)[order], len(order)
+    starts = torch.searchsorted(group, torch.arange(len(padded) * groups + 1, device=device))
+    iou, match, best = rotated_match(anchors.boxes, every, starts, labels=anchors.labels, classes=groups)
     # the first box of those whose best anchor it is; `count` is none
-    nearest = samples[:-1, None] * len(anchors) + best.view(every.shape[:2]).clamp(min=0)
+    nearest = group // groups * in_sample + best.clamp(min=0)
     of_box = torch.arange(count, device=device).masked_fill(best < 0, count)
     forced = torch.full((iou.numel(),), count, dtype=torch.int64, device=device)
-    forced = forced.scatter_reduce_(0, nearest.flatten(), of_box, "amin").view_as(match)
+    forced = forced.scatter_reduce_(0, nearest, of_box, "amin").view_as(match)
     is_forced = forced < count
     match = torch.where(is_forced, forced, match)
-    positive = (iou > positive_iou) | is_forced
-    negative = (iou < negative_iou) & ~positive
-    most = positive.numel() if per_box is None else sum(map(len, boxes)) * per_box
-    rows, unused = true_rows(positive, most)
-    of_positive = anchors[rows % len(anchors)]
-    matched = every.view(-1, 7)[match.flatten()[rows].clamp(min=0)] if count else of_positive
-    matched = torch.where(unused[:, None], of_positive, matched)
-    return Targets(positive, negative, rows, unused, *encode(matched, of_positive, regression), of_positive, matched)
+    positive = (iou > anchors.positive_iou) | is_forced
+    negative = (iou < anchors.negative_iou) & ~positive
+    rows, unused, flat, first = [], [], [], 0
+    for k, own in enumerate(positive.split(anchors.counts, dim=1)):
+        most = own.numel() if anchors.per_box is None else sum(map(len, boxes)) * anchors.per_box[k]
+        of_class, of_none = true_rows(own, most)
+        rows.append(of_class)
+        unused.append(of_none)
+        # the same anchors among those of all classes
+        flat.append((of_class + first).add_(of_class // own.shape[1], alpha=in_sample - own.shape[1]))
+        first += own.shape[1]
+    joined, no_row = torch.cat(flat), torch.cat(unused)
+    of_positive = anchors.boxes[joined % in_sample]
+    matched = every[match.flatten()[joined].clamp(min=0)] if count else of_positive
+    matched = torch.where(no_row[:, None], of_positive, matched)
+    encoded = encode(matched, of_positive, regression)
+    return Targets(positive, negative, tuple(rows), no_row, *encoded, of_positive, matched)
 
 
 def true_rows(mask: Tensor, most: int) -> tuple[Tensor, Tensor]:

@@ -1,6 +1,7 @@
 """Losses (Sec. 3.5, Eq. 5): focal, location, vertical, the optional direction, and what the supplement tried."""
 
 import functools
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -17,43 +18,61 @@ IGNORED = -100  # the direction of an unused row
 
 def focal_loss(logits: Tensor, positive: Tensor, negative: Tensor, alpha: float, gamma: float) -> Tensor:
     """Sum over the anchors (B, A) of -alpha (1 - p)^gamma log p; negatives have 1 - alpha and 1 - p in place."""
-    signed = torch.where(positive, logits, -logits)  # of the probability of what is true
-    weight = torch.where(positive, alpha, 1.0 - alpha) * (positive | negative)
-    return (weight * torch.sigmoid(-signed).pow(gamma) * F.softplus(-signed)).sum()
+    wrong = logits * torch.where(positive, -1.0, 1.0)  # of the probability of what is not true
+    weight = torch.where(positive, alpha, (1.0 - alpha) * negative)
+    return (weight * torch.sigmoid(wrong).pow(gamma) * F.softplus(wrong)).sum()
 
 
-def class_loss(maps: HeadMaps, targets: Targets, entry: ClassConfig, weights: LossConfig) -> dict[str, Tensor]:
-    """The weighted terms of one class, each divided by max(1, positives of the class in the batch of all ranks)."""
-    positives = all_reduce(targets.positive.sum()).clamp(min=1)
-    focal = focal_loss(maps.logits, targets.positive, targets.negative, entry.focal_alpha, entry.focal_gamma)
+def total_loss(
+    maps: Sequence[HeadMaps], targets: Targets, classes: Sequence[ClassConfig], weights: LossConfig
+) -> dict[str, Tensor]:
+    """The weighted terms summed over the classes, each divided by max(1, positives of its class in the batch of all
+    ranks)."""
+    sizes, anchors = [len(rows) for rows in targets.rows], [own.logits.shape[1] for own in maps]
+    used, location = ~targets.unused, rows_of([own.location for own in maps], targets)
+    vertical = rows_of([own.vertical for own in maps], targets)
+
+    def by_class(loss: Callable[..., Tensor], *rows: Tensor) -> list[Tensor]:
+        """The loss of every class's rows, of all rows (P, ...)."""
+        return [loss(*own) for own in zip(*(each.split(sizes) for each in rows), strict=True)]
+
+    def overlap(generalized: bool = False) -> Tensor:
+        return iou_pairs(targets.boxes, decode(location, vertical, None, targets.anchors), generalized)
+
+    masks = (mask.split(anchors, dim=1) for mask in (targets.positive, targets.negative))
     smooth_l1 = functools.partial(F.smooth_l1_loss, reduction="sum", beta=weights.beta)
-    location, vertical = rows_of(maps.location, targets), rows_of(maps.vertical, targets)
     if weights.box == "smooth_l1":
-        box = smooth_l1(location, targets.location)
+        box = by_class(smooth_l1, location, targets.location)
     else:
-        overlap = iou_pairs(targets.boxes, decode(location, vertical, None, targets.anchors), weights.box == "giou")
-        box = (1 - overlap).masked_fill(targets.unused, 0.0).sum()
+        box = by_class(torch.sum, (1 - overlap(weights.box == "giou")).masked_fill(targets.unused, 0.0))
     terms = {
-        "classification": weights.classification * focal,
-        "localization": weights.localization * box,
-        "vertical": weights.vertical * smooth_l1(vertical, targets.vertical),
+        "classification": [
+            focal_loss(own.logits, positive, negative, entry.focal_alpha, entry.focal_gamma)
+            for own, positive, negative, entry in zip(maps, *masks, classes, strict=True)
+        ],
+        "localization": box,
+        "vertical": by_class(smooth_l1, vertical, targets.vertical),
     }
-    if maps.direction is not None:
+    directions = [own.direction for own in maps if own.direction is not None]
+    if directions:
         bins = targets.direction.masked_fill(targets.unused, IGNORED)
-        direction = F.cross_entropy(rows_of(maps.direction, targets), bins, reduction="sum", ignore_index=IGNORED)
-        terms["direction"] = weights.direction * direction
-    if maps.iou is not None:
+        cross_entropy = functools.partial(F.cross_entropy, reduction="sum", ignore_index=IGNORED)
+        terms["direction"] = by_class(cross_entropy, rows_of(directions, targets), bins)
+    ious = [own.iou for own in maps if own.iou is not None]
+    if ious:
         with torch.no_grad():
-            overlap = iou_pairs(targets.boxes, decode(location, vertical, None, targets.anchors))
-        iou = F.binary_cross_entropy_with_logits(rows_of(maps.iou, targets), overlap, reduction="none")
-        iou = iou.masked_fill(targets.unused, 0.0).sum()
-        terms["iou"] = weights.iou * iou
-    return {name: term / positives for name, term in terms.items()}
+            wanted = overlap()
+        cross_entropy = functools.partial(F.binary_cross_entropy_with_logits, reduction="sum")
+        terms["iou"] = by_class(cross_entropy, rows_of(ious, targets), wanted, used.float())
+    positives = all_reduce(torch.stack(by_class(torch.sum, used))).clamp(min=1)
+    weighted = torch.stack([getattr(weights, name) * torch.stack(of_classes) for name, of_classes in terms.items()])
+    totals = functools.reduce(torch.add, (weighted / positives).unbind(1))
+    return dict(zip(terms, totals.unbind(), strict=True))
 
 
-def rows_of(values: Tensor, targets: Targets) -> Tensor:
-    """The rows (P, ...) of a map (B, A, ...); unused ones are 0, as their targets are, and pass no gradient on."""
-    rows = values.flatten(0, 1)[targets.rows]
+def rows_of(maps: Sequence[Tensor], targets: Targets) -> Tensor:
+    """The rows (P, ...) of the maps (B, A_k, ...); unused ones are 0, as their targets are, and pass no gradient on."""
+    rows = torch.cat([own.flatten(0, 1)[picked] for own, picked in zip(maps, targets.rows, strict=True)])
     return rows.masked_fill(targets.unused if rows.ndim == 1 else targets.unused[:, None], 0.0)
 
 

@@ -8,12 +8,12 @@ from torch import Tensor, nn
 
 from hvnet.config import Config, EncoderConfig
 from hvnet.kernels.rotated import rotated_nms
-from hvnet.network.anchors import assign_targets, boxes_of_class, decode, make_anchors, positives_per_box
+from hvnet.network.anchors import Anchors, assign_targets, decode, make_anchors, positives_per_box
 from hvnet.network.backbone import Backbone
 from hvnet.network.encoder import HybridVoxelEncoder
 from hvnet.network.grids import projection_grids
 from hvnet.network.head import Head, HeadMaps, scores_of
-from hvnet.network.loss import class_loss
+from hvnet.network.loss import total_loss
 from hvnet.network.pillars import PillarEncoder
 
 
@@ -58,13 +58,10 @@ class HVNet(nn.Module):
             for name in LOSS_TERMS:
                 if name not in ("direction", "iou") or getattr(config.head, name):
                     self.log_variances[name] = nn.Parameter(torch.zeros(()))
-        for k, entry in enumerate(config.head.classes):
-            self.register_buffer(f"anchors_{k}", make_anchors(config, entry), persistent=False)
+        classes = config.head.classes
+        per_box = [positives_per_box(config, entry) for entry in classes]
+        self.anchors = Anchors([make_anchors(config, entry) for entry in classes], classes, per_box)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
-    def anchors(self, label: int) -> Tensor:
-        """Anchors (A, 7) of a class."""
-        return self.get_buffer(f"anchors_{label}")
 
     def forward(self, points: Tensor, sample: Tensor, batch_size: int) -> list[HeadMaps]:
         """Points (N, 4) of samples (N,) to the maps of every class."""
@@ -82,13 +79,8 @@ class HVNet(nn.Module):
 
         With learnt weights a term L is exp(-s) L + s, s the logarithm of its variance (Kendall et al., CVPR 2018).
         """
-        total: dict[str, Tensor] = {}
-        for k, entry in enumerate(self.config.head.classes):
-            own = boxes_of_class(boxes, labels, k)
-            thresholds, most = (entry.positive_iou, entry.negative_iou), positives_per_box(self.config, entry)
-            targets = assign_targets(self.anchors(k), own, *thresholds, self.config.head.regression, most)
-            for name, term in class_loss(maps[k], targets, entry, self.config.loss).items():
-                total[name] = total[name] + term if name in total else term
+        targets = assign_targets(self.anchors, boxes, labels, self.config.head.regression)
+        total = total_loss(maps, targets, self.config.head.classes, self.config.loss)
         for name, s in self.log_variances.items():
             total[name] = (-s).exp() * total[name] + s
         return total
