@@ -217,7 +217,7 @@ def assign_targets(
         rows.append(of_class)
         unused.append(of_none)
         # the same anchors among those of all classes
-        flat.append((of_class + first).add_(of_class // own.shape[1], alpha=in_sample - own.shape[1]))
+        flat.append(torch.add(of_class + first, of_class // own.shape[1], alpha=in_sample - own.shape[1]))
         first += own.shape[1]
     joined, no_row = torch.cat(flat), torch.cat(unused)
     of_positive = anchors.boxes[joined % in_sample]

@@ -33,7 +33,10 @@ def total_loss(
     vertical = rows_of([own.vertical for own in maps], targets)
 
     def by_class(loss: Callable[..., Tensor], *rows: Tensor) -> list[Tensor]:
-        """The loss of every class's rows, of all rows (P, ...)."""
+        """The loss of every class's rows, of all rows (P, ...).
+
+        One by one: sums and the ends of vectors round by position, and so a class's bits do not depend on the others.
+        """
         return [loss(*own) for own in zip(*(each.split(sizes) for each in rows), strict=True)]
 
     def overlap(generalized: bool = False) -> Tensor:
