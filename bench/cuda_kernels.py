@@ -30,6 +30,7 @@ DOMAINS: dict[str, Sequence[Any]] = {
     "dtype": tuple(WARP_FLOAT.values()),
     "lanes": tuple({lanes_of(count, CUDA) for count in (1, 4, 16, 64, 128)}),
     "image_dtype": (wp.float32, wp.float16, wp.bfloat16),
+    "map_dtype": (wp.float32, wp.float16, wp.bfloat16),
 }
 """What the parameters of the functions that make kernels can be, on a GPU."""
 STACK_OF = {"sin": 32, "cos": 32, "mesh_query_ray": 320}

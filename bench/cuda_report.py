@@ -38,6 +38,7 @@ from hvnet.data.scenes.files import make_frame
 from hvnet.data.scenes.street import Options
 from hvnet.data.sensor import inside
 from hvnet.exceptions import InputError
+from hvnet.kernels.shares import CHUNK
 from hvnet.kernels.voxel import voxel_index
 from hvnet.network.backbone import ConvReLU
 from hvnet.network.detector import Detector
@@ -57,12 +58,12 @@ MEMORY = 0.8  # share of the bandwidth that passes over large tensors reach
 GATHER = 0.5  # ... kernels that gather rows and write ends
 CONVOLUTION = 0.62  # share of the roofline that cuDNN reaches over the backbone's layers: 222 of 350 us
 CHAIN_US = 0.15  # a point that a thread goes through: loads that wait for each other
-CHUNK = 32  # points that a thread goes through where work is divided by points
 FEW = 1024  # threads of a launch that does not hide how long memory takes, as the sweep of an NMS
 LOADS = 100  # that wait for each other in such a launch
 KERNELS = {"sort": 8, "topk": 12, "cumsum": 3, "cat": 1}
 """Kernels that torch starts for one operation, where it is not one."""
 
+ARCHS = (75, 80, 86, 87, 89, 90, 100, 120)
 BOUND_FRAME_US, BOUND_LAUNCHES, BOUND_BACKWARD_US = 1000.0, 150, 500.0
 
 
@@ -342,7 +343,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(prog="bench/cuda_report.py", description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
-    parser.add_argument("--arch", type=int, default=90, help="of the compiled kernels: 80 is sm_80 (default: 90)")
+    parser.add_argument("--arch", type=int, choices=ARCHS, default=90, help="80 is sm_80 (default: 90)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all of it there as JSON")
     parser.add_argument("--points", type=Path, metavar="FILE", help="a velodyne .bin (default: a generated scan)")
     parser.add_argument(
@@ -357,6 +358,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     for name in ("cuobjdump", "nvdisasm"):
         if cuda_kernels.tool(name) is None:
             raise InputError(f"{name} is missing: {cuda_kernels.PIP}")
+    if args.json and not args.json.parent.is_dir():
+        raise InputError(f"--json {args.json}: its folder does not exist")
     rates = args.bandwidth, args.float32, args.tf32, args.bfloat16
     if min(rates) <= 0:
         raise InputError("--bandwidth, --float32, --tf32 and --bfloat16: want numbers above 0")

@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "bench" / "results" / "gpu"
 WAITS = "test_a_step_waits_no_more_than_twice"
 """The test that counts how often a step of training waits for the device."""
-SANITIZED = "test_opcheck or test_images_of_a_detector"
+SANITIZED = "test_opcheck or test_images_of_a_detector or test_place or test_candidates"
 """The tests that call every op, and the kernels that only inference uses."""
 NAMED = 10  # tests that failed; the others are counted
 TOOLS = ("memcheck", "racecheck", "synccheck")  # not initcheck: the tests fill new memory with NaN, and see that

@@ -81,14 +81,14 @@ def _sigmoid(logit: float):
 
 
 @functools.cache
-def _kernels(dtype: Any) -> SimpleNamespace:
+def _kernels(map_dtype: Any) -> SimpleNamespace:
     """The kernels that read maps of one floating type, in a module of their own."""
-    module = wp.Module(f"hvnet_candidates_{dtype.__name__}", None)
+    module = wp.Module(f"hvnet_candidates_{map_dtype.__name__}", None)
 
     @wp.kernel(enable_backward=False, module=module)
     def write_keys(
-        logits: wp.array2d(dtype=dtype),
-        iou: wp.array2d(dtype=dtype),
+        logits: wp.array2d(dtype=map_dtype),
+        iou: wp.array2d(dtype=map_dtype),
         has_iou: int,
         threshold: float,
         label: int,
@@ -106,7 +106,7 @@ def _kernels(dtype: Any) -> SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module=module)
     def gather_patches(
-        level: wp.array4d(dtype=dtype),
+        level: wp.array4d(dtype=map_dtype),
         keys: wp.array3d(dtype=wp.int64),
         label: int,
         per_cell: int,

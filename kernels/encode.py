@@ -102,7 +102,7 @@ def voxel_means(points: Tensor, index: NestedIndex, finest: int, rows: int) -> T
     sums = points.new_empty(rows, 4, dtype=torch.float64)
     ends = points.new_empty(2, tasks, 4, dtype=torch.float64)
     indexed = [array(index.starts), array(index.voxel), array(index.counts), finest]
-    inputs = [*indexed, size, array(ends, 4), array(sums, 4), array(means, 4)]
+    inputs = [*indexed, size, array(ends, 4), array(sums, 4)]
     launch(_sums, tasks, [array(points, 4), *inputs], points.device)
     launch(_sums_join, tasks, inputs, points.device)
     launch(_means, (scales, rows), [*indexed, array(sums, 4), array(means, 4)], points.device)
@@ -634,7 +634,6 @@ def _sums(
     size: int,
     ends: wp.array2d(dtype=wp.vec4d),
     sums: wp.array(dtype=wp.vec4d),
-    means: wp.array2d(dtype=wp.vec4),
 ):
     """Sums of the points of every voxel of the finest scale."""
     task = wp.tid()
@@ -664,7 +663,6 @@ def _sums_join(
     size: int,
     ends: wp.array2d(dtype=wp.vec4d),
     sums: wp.array(dtype=wp.vec4d),
-    means: wp.array2d(dtype=wp.vec4),
 ):
     task = wp.tid()
     v = cut_voxel(task, size, int(counts[starts.shape[0]]), voxel[finest], voxel[finest, 0:0], starts[finest])

@@ -29,9 +29,9 @@ def after_warm_up(run: Callable[[], object], record: Record) -> Counter[str]:
 
 
 def frame(detector: Detector, batch_size: int) -> object:
-    """From points to boxes on the host, as the detector goes."""
+    """From points to the table of boxes, as the detector goes."""
     points, counts = torch.empty(batch_size, POINTS, 4, device=CUDA), torch.empty(batch_size, device=CUDA).int()
-    return detector.numbers(points, counts, torch.zeros(batch_size * POINTS, device=CUDA).long()).cpu()
+    return detector.numbers(points, counts, torch.zeros(batch_size * POINTS, device=CUDA).long())
 
 
 def step(model: HVNet, batch_size: int) -> object:
@@ -47,7 +47,7 @@ def test_a_frame_asks_the_host_for_nothing(config: str, batch_size: int) -> None
     with fake_cuda() as record, torch.no_grad():
         detector = Detector(HVNet(load_config(CONFIGS / f"{config}.yaml")).eval(), CUDA, ground=-1.7)
         assert after_warm_up(lambda: frame(detector, batch_size), record) == Counter()
-        assert record.to_host.total() == 1  # the boxes, and the end
+        assert record.to_host == Counter()
         assert record.launches.total() > 10
 
 

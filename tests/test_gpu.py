@@ -251,5 +251,5 @@ def test_sanitizer(gpu: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pyt
     for file in ("encode", "raycast", "rotated", "scatter", "voxel"):
         assert "def test_opcheck(" in (ROOT / "tests" / f"test_{file}.py").read_text()
     assert "def test_images_of_a_detector(" in (ROOT / "tests" / "test_cuda.py").read_text()
-    assert gpu.SANITIZED == "test_opcheck or test_images_of_a_detector"
+    assert gpu.SANITIZED == "test_opcheck or test_images_of_a_detector or test_place or test_candidates"
     assert gpu.WAITS in (ROOT / "tests" / "test_cuda.py").read_text()

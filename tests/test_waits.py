@@ -30,13 +30,19 @@ def many_threads(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def waits(work: Callable[[], object]) -> list[str]:
     """The operations of `work`, those inside of ops included, for which the host would wait."""
-    found, plain = [], Tensor.tolist
+    found: list[str] = []
 
-    def tolist(tensor: Tensor) -> list:
-        found.append("tolist")  # on the CPU it is no operation of torch's
-        return plain(tensor)
+    def counted(name: str) -> mock._patch:
+        """On the CPU these are no operations of torch's."""
+        plain = getattr(Tensor, name)
 
-    with mock.patch.object(Tensor, "tolist", tolist), profile(activities=[ProfilerActivity.CPU]) as recorded:
+        def call(tensor: Tensor, *arguments: object, **options: object) -> object:
+            found.append(name)
+            return plain(tensor, *arguments, **options)
+
+        return mock.patch.object(Tensor, name, call)
+
+    with counted("tolist"), counted("cpu"), counted("numpy"), profile(activities=[ProfilerActivity.CPU]) as recorded:
         work()
     events = recorded.events()
     assert events is not None
@@ -53,6 +59,7 @@ def test_what_waits_is_counted() -> None:
     assert waits(lambda: values.sum().item()) == ["aten::_local_scalar_dense"]
     assert waits(lambda: bool(values.any())) == ["aten::_local_scalar_dense"]
     assert waits(lambda: values.tolist()) == ["tolist"]
+    assert waits(lambda: values.cpu().numpy()) == ["cpu", "numpy"]
     assert waits(lambda: values.new_tensor([1, 2])) == ["aten::lift_fresh"]
     assert waits(lambda: torch.where(values > 1, values, 0).cumsum(0)) == []
 

@@ -41,7 +41,8 @@ class ConvReLU(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Features (B, C, H, W) to (B, C', H', W')."""
-        if features.device.type == "cuda" and torch.backends.cudnn.is_available():
+        on_cuda = features.device.type == "cuda" and not torch.compiler.is_compiling()
+        if on_cuda and torch.backends.cudnn.is_available():
             if features.shape not in self.one_kernel:
                 self.one_kernel[features.shape] = self.has_one_kernel(features)
             if self.one_kernel[features.shape]:
@@ -58,6 +59,7 @@ class ConvReLU(nn.Module):
 
     def has_one_kernel(self, features: Tensor) -> bool:
         """Whether cuDNN's fused kernel exists for this layer and gives what the two give. Reads the device."""
+        features = torch.randn_like(features)  # the frame that is captured first is empty
         wanted = F.relu_(self.convolution(features))
         # memory that the next output takes: cuDNN is given it as an addend too, with a weight of 0
         torch.full_like(wanted, torch.nan)

@@ -333,7 +333,7 @@ def detections(table: Tensor) -> list[Detections]:
     found = []
     for rows in table.flatten(1, 2):
         kept = rows[rows[:, 9] > 0]
-        found.append(Detections(kept[:, :7], kept[:, 7], kept[:, 8].long()))
+        found.append(Detections(kept[:, :7].contiguous(), kept[:, 7].contiguous(), kept[:, 8].long()))
     return found
 
 

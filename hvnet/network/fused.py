@@ -89,7 +89,7 @@ class FusedEncoder:
         self.encoded = torch.arange(len(self.feature_grids), dtype=torch.int32, device=device)
         projected = [self.grids.index(grid) for grid in self.projection_grids]
         self.projected = torch.tensor(projected, dtype=torch.int32, device=device)
-        self.written: dict[tuple, tuple[Images, Scales]] = {}  # images, and the voxels that were written last
+        self.written: dict[tuple, tuple[Images, Scales | None]] = {}  # images, and the voxels that were written last
 
     @torch.no_grad()
     def __call__(
@@ -143,7 +143,7 @@ class FusedEncoder:
         key = (batch_size, dtype, device)
         if key in self.written:
             images, last = self.written[key]
-            if many_threads(device):
+            if last is None:
                 images.cells.zero_()  # a graph replays what was captured: it would not know the cells written last
             else:
                 clear_voxels(images.cells, last, self.projected, images.first)
@@ -151,7 +151,7 @@ class FusedEncoder:
             cells = self.cells(batch_size)
             first = torch.tensor([sum(cells[:k]) for k in range(len(cells))], device=device)
             images = Images(torch.zeros(sum(cells), channels, dtype=dtype, device=device), first)
-        self.written[key] = images, scales
+        self.written[key] = images, None if many_threads(device) else scales  # which would keep a graph's memory
         return images
 
 

@@ -124,6 +124,9 @@ class Run:
                 fused=many_threads(device) or None,
             )
             self.progress = self.restore() if resume else Progress()
+            # that a step which is not finite must not change; anchors are buffers as well, and constant
+            kept = self.model.state_dict() if config.train.skip_non_finite else {}
+            self.statistics = [name for name, _ in self.model.named_buffers() if name in kept]
         self.stamp_frames()
         self.say(
             f"{len(data.train)} frames to train, {len(data.val)} to validate, on {device}; the run is {out}", flush=True
@@ -204,7 +207,7 @@ class Run:
             group["lr"] = learning_rate(config, progress.step, progress.epoch, config.epochs * len(self.loader))
         print_once(batch.notes, self.seen)
         batch = batch.to(self.device)
-        statistics = {name: buffer.clone() for name, buffer in model.named_buffers() if config.skip_non_finite}
+        statistics = {name: model.get_buffer(name).clone() for name in self.statistics}
         maps = self.joint(batch.points, batch.sample, len(batch.boxes))
         terms = model.loss(maps, batch.boxes, batch.labels)
         loss = torch.stack(list(terms.values())).sum()
@@ -219,9 +222,10 @@ class Run:
             self.optimizer.step()
         elif finite:
             self.optimizer.step()
-        for name, statistic in statistics.items():  # the batch norms have seen what is not finite
-            buffer = model.get_buffer(name)
-            buffer.copy_(torch.where(finite, buffer, statistic))
+        if many_threads(self.device) or not finite:
+            for name, statistic in statistics.items():  # the batch norms have seen what is not finite
+                buffer = model.get_buffer(name)
+                buffer.copy_(torch.where(finite, buffer, statistic))
         self.unread.append(Step(progress.step, batch.names, tuple(terms), numbers))
 
     def read_steps(self) -> list[dict[str, float]]:
@@ -285,11 +289,16 @@ class Run:
         with deterministic():
             for batch in bar:
                 if isinstance(batch, InputError):
+                    if self.unread:  # one of these steps may have to be noted
+                        self.read_steps()
                     raise batch
                 self.step(batch)
                 step, batches = step + 1, batches + 1
                 self.progress = Progress(epoch, batches, step, sums)
-                if len(self.unread) < self.config.train.report_every and batches < len(self.loader):
+                # several ranks have to agree on when they read
+                urgent = self.signals or time.monotonic() - saved > SAVE_SECONDS
+                is_due = len(self.unread) >= self.config.train.report_every or batches == len(self.loader)
+                if not is_due and not (urgent and ranks.size() == 1):
                     continue
                 stop = 0.0
                 for losses in self.read_steps():
@@ -327,8 +336,8 @@ class Run:
     def train(self) -> None:
         """Runs the remaining epochs; writes checkpoint.pt, metrics.jsonl, tensorboard/ and pictures/.
 
-        SIGTERM or SIGINT ends it at the next report, after the step that is under way if there is one a step: the run
-        is saved, and Stopped raised.
+        SIGTERM or SIGINT ends it after the step that is under way, with several ranks at the next report: the run is
+        saved, and Stopped raised.
         """
         self.signals.clear()  # of an earlier call
         with caught_signals(self.signals), self.open_board():
