@@ -141,7 +141,7 @@ def kernel_names(source: str) -> set[str]:
 
 
 def written_kernels() -> set[str]:
-    """module.function of every kernel that stands in the package's files."""
+    """module.function of every kernel in the package's files."""
     (folder,) = hvnet.kernels.__path__
     files = sorted(Path(folder).glob("*.py"))
     return {f"{file.stem}.{name}" for file in files for name in kernel_names(file.read_text(encoding="utf-8"))}

@@ -80,7 +80,7 @@ class Record:
 
 
 class Watch(TorchDispatchMode):
-    """Writes operations down, and runs the bodies of the project's own instead of their fakes.
+    """Records operations, and runs the bodies of the project's own instead of their fakes.
 
     `sizes` replaces operations of the project whose results have lengths that depend on data.
     """

@@ -16,10 +16,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from hvnet.kernels.launch import array, launch
+from hvnet.kernels.launch import LARGEST, LOW_BITS, array, launch
 
-LARGEST = wp.int32(0x7FFFFFFF)
-LOW_BITS = wp.int64(0x7FFFFFFF)
 PI = 3.14159265358979
 
 

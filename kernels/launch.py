@@ -16,6 +16,8 @@ wp.config.log_level = wp.LOG_WARNING  # no banner, no line for every module that
 
 FLOATS = (torch.float32, torch.float64)
 WARP_FLOAT = {torch.float32: wp.float32, torch.float64: wp.float64}
+LARGEST = wp.int32(0x7FFFFFFF)
+LOW_BITS = wp.int64(0x7FFFFFFF)  # of a key with an index below and what is compared above
 MAX_STRIDE = 2**31 - 1  # bytes: Warp keeps the strides of an array as int32
 
 force_many_threads = False

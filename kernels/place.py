@@ -13,7 +13,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from hvnet.kernels.launch import array, check_tensor, launch
+from hvnet.kernels.launch import LARGEST, LOW_BITS, array, check_tensor, launch
 
 NEAREST, NEAR, FAR = 3.0, 15.0, 50.0
 """Metres from the sensor: the ground is looked for between the first two, and up to the third where few points are."""
@@ -40,8 +40,6 @@ LEVELS = 2**17  # centimetres of height in a key
 SIDE = 100  # cells of 1 m along a side of the wider search
 CELLS = SIDE * SIDE
 STRIDE = 2048  # threads that go through a cloud for a sum or an extreme: few, since they end in one place
-LARGEST = wp.int32(0x7FFFFFFF)
-LOW_BITS = wp.int64(0x7FFFFFFF)
 
 
 def ground_heights(points: Tensor, counts: Tensor) -> Tensor:

@@ -32,7 +32,7 @@ from tests.helpers import random_boxes
 from tests.models import CONFIGS, NARROW, some_points
 from tests.models import SMALL as DETECTOR_CONFIG
 
-ODD = ["encoder.feature_channels=3", "encoder.image_channels=5"]
+INDIVISIBLE = ["encoder.feature_channels=3", "encoder.image_channels=5"]
 """Channels that no vector length divides, so that one thread takes the same kernels as many."""
 
 
@@ -112,7 +112,7 @@ def encode() -> None:
 def detect() -> None:
     """From points to boxes, and a training step's losses."""
     torch.manual_seed(0)
-    model = HVNet(load_config(CONFIGS / "demo.yaml", [*DETECTOR_CONFIG, *NARROW, *ODD]))
+    model = HVNet(load_config(CONFIGS / "demo.yaml", [*DETECTOR_CONFIG, *NARROW, *INDIVISIBLE]))
     points = some_points(60)
     maps = model(points, torch.zeros(len(points), dtype=torch.int64), 1)
     terms = model.loss(maps, [random_boxes(4, 0, centre=5.0).float()], [torch.tensor([0, 0, 1, 2])])

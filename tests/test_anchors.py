@@ -210,7 +210,7 @@ def test_targets_of_classes_are_those_of_each_alone(demo: Config, threads: None)
     joint = assign_targets(anchors, boxes, labels)
     positive, negative = (mask.split(anchors.counts, dim=1) for mask in joint[:2])
     used = [~unused for unused in joint.unused.split([len(rows) for rows in joint.rows])]
-    of_rows = [values.split([len(rows) for rows in joint.rows]) for values in joint[4:]]
+    split_by_class = [values.split([len(rows) for rows in joint.rows]) for values in joint[4:]]
     for k, entry in enumerate(classes):
         assert torch.equal(anchors(k), grids[k])
         own = [each[of_each == k] for each, of_each in zip(boxes, labels, strict=True)]
@@ -219,7 +219,7 @@ def test_targets_of_classes_are_those_of_each_alone(demo: Config, threads: None)
         assert torch.equal(negative[k], alone.negative)
         assert torch.equal(joint.rows[k][used[k]], alone.rows[0][~alone.unused])
         assert used[k].sum() > 5
-        for values, want in zip(of_rows, alone[4:], strict=True):
+        for values, want in zip(split_by_class, alone[4:], strict=True):
             assert torch.equal(values[k][used[k]], want[~alone.unused])
 
 

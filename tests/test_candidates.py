@@ -105,12 +105,12 @@ def test_boxes_are_those_of_one_thread(scale: float, regression: str, direction:
         for label, entry in enumerate(head.classes):
             best = keys[b, label].sort(descending=True).values[:40]
             best = best[best >= 0]
-            at = LARGEST - (best & LARGEST)
+            chosen = LARGEST - (best & LARGEST)
             with torch.no_grad():
-                values = regress(levels[entry.level][b], at, weights[label], 4 * len(entry.anchor_sizes))
+                values = regress(levels[entry.level][b], chosen, weights[label], 4 * len(entry.anchor_sizes))
             count = 8 if regression == "corners" else 5
             turns = values[:, count + 2 :].argmax(dim=1) if direction else None
-            wanted = decode(values[:, :count], values[:, count : count + 2], turns, anchors[label][at])
+            wanted = decode(values[:, :count], values[:, count : count + 2], turns, anchors[label][chosen])
             valid = wanted.isfinite().all(dim=1)
             found = rows.table[b, label, : len(best)].cpu()
             assert torch.equal(rows.valid[b, label, : len(best)].cpu(), valid)

@@ -106,12 +106,12 @@ def test_one_thread_and_many_give_the_same_maxima(
     """Voxels longer than what a thread takes, some without points, ties between parts, and a NaN in one of them."""
     cpu = torch.device("cpu")
     for count, voxels in ((500, 3), (96, 3), (97, 200), (CHUNK, 1), (CHUNK + 1, 1), (0, 2)):
-        features, points, mean, layer, at = case(count, voxels, 3, torch.float32, cpu, ordered)
+        features, points, mean, layer, own = case(count, voxels, 3, torch.float32, cpu, ordered)
         features = (4 * features).round() / 4  # equal values
         if count:
             points, mean, layer = points.round(), mean.round(), layer.round()
             features[count // 2, 1] = math.nan
-        inputs = features, points, mean, layer, at.voxel, at.order, at.starts, relu, True
+        inputs = features, points, mean, layer, own.voxel, own.order, own.starts, relu, True
         monkeypatch.setattr(launch, "force_many_threads", False)
         want = torch.ops.hvnet.attend(*inputs)
         monkeypatch.setattr(launch, "force_many_threads", True)

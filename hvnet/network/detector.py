@@ -303,13 +303,13 @@ class Detector:
 
     def _candidates(self, label: int, b: int, levels: list[Tensor], scores: Tensor) -> Candidates:
         head, entry = self.config.head, self.entries[label]
-        at = (scores > head.score_threshold).nonzero().squeeze(1)
-        at = at[torch.sort(scores[at], descending=True, stable=True).indices[: head.candidates]]
-        scores = scores[at]
-        values = regress(levels[entry.level][b], at, self.regression_weights[label], anchors_per_cell(entry))
+        chosen = (scores > head.score_threshold).nonzero().squeeze(1)
+        chosen = chosen[torch.sort(scores[chosen], descending=True, stable=True).indices[: head.candidates]]
+        scores = scores[chosen]
+        values = regress(levels[entry.level][b], chosen, self.regression_weights[label], anchors_per_cell(entry))
         count = LOCATION_VALUES[head.regression]
         direction = values[:, count + 2 :].argmax(dim=1) if head.direction else None
-        boxes = decode(values[:, :count], values[:, count : count + 2], direction, self.anchors[label][at])
+        boxes = decode(values[:, :count], values[:, count : count + 2], direction, self.anchors[label][chosen])
         return Candidates(boxes, scores, boxes.isfinite().all(dim=1))
 
     def suppress(self, candidates: list[list[Candidates]] | Rows) -> list[Detections]:
@@ -378,19 +378,21 @@ def regression_weight(head: Head) -> Tensor:
     return torch.cat(parts, dim=2).flatten(1).detach().float()
 
 
-def regress(level: Tensor, at: Tensor, weight: Tensor, anchors: int) -> Tensor:
-    """The outputs of a head's 3 x 3 convolutions for the anchors at (K,) of a level (C, N_L, N_W): (K, values)."""
+def regress(level: Tensor, chosen: Tensor, weight: Tensor, anchors: int) -> Tensor:
+    """The outputs of a head's 3 x 3 convolutions for the chosen anchors (K,) of a level (C, N_L, N_W): (K, values)."""
     channels, n_l, n_w = level.shape
     rows = level.permute(1, 2, 0).reshape(-1, channels)
-    cell = at // anchors
-    step = torch.arange(-1, 2, device=at.device)
+    cell = chosen // anchors
+    step = torch.arange(-1, 2, device=chosen.device)
     x = (cell // n_w)[:, None, None] + step[:, None]
     y = (cell % n_w)[:, None, None] + step
     inside = (x >= 0) & (x < n_l) & (y >= 0) & (y < n_w)
-    patches = rows[(x.clamp(0, n_l - 1) * n_w + y.clamp(0, n_w - 1)).flatten()].float().view(len(at), 9, channels)
-    patches = patches * inside.view(len(at), 9, 1)
-    values = torch.addmm(weight[-1], patches.flatten(1), weight[:-1]).view(len(at), anchors, weight.shape[1] // anchors)
-    return values[torch.arange(len(at), device=at.device), at % anchors]
+    patches = rows[(x.clamp(0, n_l - 1) * n_w + y.clamp(0, n_w - 1)).flatten()].float().view(len(chosen), 9, channels)
+    patches = patches * inside.view(len(chosen), 9, 1)
+    values = torch.addmm(weight[-1], patches.flatten(1), weight[:-1]).view(
+        len(chosen), anchors, weight.shape[1] // anchors
+    )
+    return values[torch.arange(len(chosen), device=chosen.device), chosen % anchors]
 
 
 def _is_number(value: object) -> bool:
