@@ -251,7 +251,7 @@ def model_training(config: Config, device: Device, cloud: Cloud) -> list[Stage]:
         points, sample = torch.empty(count, 4), torch.zeros(count, dtype=torch.int64)
         boxes, labels = [torch.empty(8, 7)] * batch, [torch.zeros(8, dtype=torch.int64)] * batch
         record.work.clear()
-        terms = model.loss(model(points, sample, batch), boxes, labels)
+        terms = model(points, sample, boxes, labels)
         torch.stack(list(terms.values())).sum().backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), config.train.gradient_clip)
         optimizer.step()

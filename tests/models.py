@@ -76,7 +76,7 @@ def lively(config: Config, **head: object) -> HVNet:
             torch.nn.init.uniform_(module.bias, -0.5, 0.5)
             module.momentum = 1.0
     with torch.no_grad():
-        model(*some_clouds(2), 2)
+        model.maps(*some_clouds(2), 2)
     return model.eval()
 
 

@@ -114,8 +114,8 @@ def detect() -> None:
     torch.manual_seed(0)
     model = HVNet(load_config(CONFIGS / "demo.yaml", [*DETECTOR_CONFIG, *NARROW, *INDIVISIBLE]))
     points = some_points(60)
-    maps = model(points, torch.zeros(len(points), dtype=torch.int64), 1)
-    terms = model.loss(maps, [random_boxes(4, 0, centre=5.0).float()], [torch.tensor([0, 0, 1, 2])])
+    boxes, labels = [random_boxes(4, 0, centre=5.0).float()], [torch.tensor([0, 0, 1, 2])]
+    terms = model(points, torch.zeros(len(points), dtype=torch.int64), boxes, labels)
     torch.stack(list(terms.values())).sum().backward()
     Detector(model.eval(), torch.device("cpu"), torch.float32, ground=-1.7).batch([points, points[:40]])
 

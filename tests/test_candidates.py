@@ -10,7 +10,7 @@ from torch import Tensor
 from hvnet.config import Config, load_config
 from hvnet.kernels.candidates import gather_patches, write_keys
 from hvnet.network.anchors import MAX_HEIGHT, decode, make_anchors
-from hvnet.network.detector import regress, regression_weight
+from hvnet.network.detector import regression_weight
 from hvnet.network.head import Head, scores_of
 from hvnet.network.static import BoxSteps
 from tests.models import CONFIGS, NARROW
@@ -107,7 +107,7 @@ def test_boxes_are_those_of_one_thread(scale: float, regression: str, direction:
             best = best[best >= 0]
             chosen = LARGEST - (best & LARGEST)
             with torch.no_grad():
-                values = regress(levels[entry.level][b], chosen, weights[label], 4 * len(entry.anchor_sizes))
+                values = regress(levels[entry.level][b : b + 1], chosen, weights[label], 4 * len(entry.anchor_sizes))
             count = 8 if regression == "corners" else 5
             turns = values[:, count + 2 :].argmax(dim=1) if direction else None
             wanted = decode(values[:, :count], values[:, count : count + 2], turns, anchors[label][chosen])

@@ -326,8 +326,8 @@ def losses_of(model: HVNet, device: torch.device) -> tuple[dict[str, Tensor], li
     """The losses of three clouds, the gradients of all weights that have one, and the statistics afterwards."""
     model = copy.deepcopy(model).to(device).train()
     points, sample = some_clouds(3)
-    maps = model(points.to(device), sample.to(device), 3)
-    terms = model.loss(maps, [boxes.to(device) for boxes in BOXES], [labels.to(device) for labels in LABELS])
+    boxes, labels = [own.to(device) for own in BOXES], [own.to(device) for own in LABELS]
+    terms = model(points.to(device), sample.to(device), boxes, labels)
     torch.stack(list(terms.values())).sum().backward()
     gradients = [weight.grad for weight in model.parameters() if weight.grad is not None]
     return {name: term.detach() for name, term in terms.items()}, gradients, [b.float() for b in model.buffers()]
@@ -369,7 +369,7 @@ def test_losses_without_boxes(demo: Config) -> None:
     for device in (CPU, GPU):
         own = copy.deepcopy(model).to(device).train()
         boxes, labels = torch.zeros(0, 7, device=device), torch.zeros(0, dtype=torch.int64, device=device)
-        terms = own.loss(own(points.to(device), sample.to(device), 2), [boxes] * 2, [labels] * 2)
+        terms = own(points.to(device), sample.to(device), [boxes] * 2, [labels] * 2)
         torch.stack(list(terms.values())).sum().backward()
         results.append({name: float(term) for name, term in terms.items()})
         assert all(weight.grad is None or weight.grad.isfinite().all() for weight in own.parameters())

@@ -27,12 +27,11 @@ from hvnet.network.detector import (
     detections,
     fold_batch_norms,
     load,
-    regress,
     regression_weight,
     turned,
     turns_all_round,
 )
-from hvnet.network.head import Head
+from hvnet.network.head import Head, regress
 from hvnet.network.model import Detections, HVNet
 from tests.models import CONFIGS, NARROW, lively, some_points
 
@@ -97,7 +96,7 @@ def test_regression_of_chosen_anchors_equals_the_convolutions(demo: Config) -> N
     assert maps.direction is not None
     want = torch.cat((maps.location[0], maps.vertical[0], maps.direction[0]), dim=1)
     at = torch.randperm(5 * 3 * 8)
-    found = regress(level[0], at, regression_weight(head), 8)
+    found = regress(level, at, regression_weight(head), 8)
     torch.testing.assert_close(found, want[at], rtol=1e-5, atol=1e-5)
 
 

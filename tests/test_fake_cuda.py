@@ -36,10 +36,9 @@ def frame(detector: Detector, batch_size: int) -> object:
 
 def step(model: HVNet, batch_size: int) -> object:
     """From points to losses, as training goes."""
-    maps = model(torch.empty(POINTS, 4, device=CUDA), torch.zeros(POINTS, device=CUDA).long(), batch_size)
     boxes = [torch.empty(6, 7, device=CUDA) for _ in range(batch_size)]
     labels = [torch.zeros(6, device=CUDA).long() for _ in range(batch_size)]
-    return model.loss(maps, boxes, labels)
+    return model(torch.empty(POINTS, 4, device=CUDA), torch.zeros(POINTS, device=CUDA).long(), boxes, labels)
 
 
 @pytest.mark.parametrize(("config", "batch_size"), [("hvnet", 1), ("compact", 2)])

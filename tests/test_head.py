@@ -1,8 +1,12 @@
 """The head's maps as rows of anchors."""
 
+import dataclasses
+
+import pytest
 import torch
 
-from hvnet.network.head import anchor_rows
+from hvnet.config import Config
+from hvnet.network.head import Head, anchor_rows
 
 
 def test_anchor_rows_have_the_order_of_the_anchors() -> None:
@@ -13,3 +17,27 @@ def test_anchor_rows_have_the_order_of_the_anchors() -> None:
     rows = anchor_rows(output, values)[0]
     assert rows.shape == (n_l * n_w * per_cell, values)
     assert rows[(1 * n_w + 3) * per_cell + 2].tolist() == [100 + 30 + 4, 100 + 30 + 5]
+
+
+@pytest.mark.parametrize("optional", [False, True])
+def test_chosen_anchors_have_the_values_and_gradients_of_the_maps(optional: bool, demo: Config) -> None:
+    """Of two samples on a level that is not square, in any order and one of them twice."""
+    torch.manual_seed(0)
+    entry = dataclasses.replace(demo.head.classes[0], anchor_sizes=((3.9, 1.6, 1.5), (8.0, 2.5, 3.0)))
+    head = Head(entry, 6, dataclasses.replace(demo.head, direction=optional, iou=optional)).double()
+    level = torch.randn(2, 6, 5, 3, dtype=torch.float64, requires_grad=True)
+    chosen = torch.cat((torch.randperm(2 * 5 * 3 * 8), torch.tensor([7])))
+    maps, found = head(level), head.regress(level, chosen)
+    assert (found.direction is None, found.iou is None) == (not optional, not optional)
+    given = [
+        (own, of_map.flatten(0, 1)[chosen]) for own, of_map in zip(found, maps[1:], strict=True) if own is not None
+    ]
+    for own, of_map in given:
+        torch.testing.assert_close(own, of_map, rtol=1e-5, atol=1e-6)  # both are float32
+    leaves = [level, head.location.weight, head.location.bias, head.vertical.weight]
+    gradients = [
+        torch.autograd.grad(torch.stack([each.square().sum() for each in side]).sum(), leaves, retain_graph=True)
+        for side in zip(*given, strict=True)
+    ]
+    for own, of_map in zip(*gradients, strict=True):
+        torch.testing.assert_close(own, of_map, rtol=1e-4, atol=1e-4)

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from hvnet.config import Config, LossConfig, load_config
 from hvnet.kernels.rotated import rotated_iou_bev
-from hvnet.network.head import LOCATION_VALUES, HeadMaps
+from hvnet.network.anchors import Targets, assign_targets
+from hvnet.network.head import LOCATION_VALUES, HeadMaps, Regressed
 from hvnet.network.loss import focal_loss, iou_pairs, total_loss
 from hvnet.network.model import HVNet
 from tests.models import CONFIGS, match_class, some_points
@@ -70,6 +71,22 @@ def test_gradients_of_equal_and_of_distant_boxes_are_finite() -> None:
         assert moved.grad.isfinite().all()
 
 
+def at_targets(maps: list[HeadMaps], targets: Targets) -> list[Regressed]:
+    """The rows of the targets of every class, out of the maps of all anchors."""
+    parts = [
+        [None if each is None else each.flatten(0, 1)[rows] for each in of_class[1:]]
+        for of_class, rows in zip(maps, targets.rows, strict=True)
+    ]
+    return [Regressed(*own) for own in parts]  # type: ignore[arg-type]
+
+
+def loss_of_maps(model: HVNet, maps: list[HeadMaps], boxes: list[Tensor], labels: list[Tensor]) -> dict[str, Tensor]:
+    """`HVNet.loss` of maps that are given."""
+    targets = assign_targets(model.anchors, boxes, labels, model.config.head.regression)
+    logits = [of_class.logits for of_class in maps]
+    return total_loss(logits, at_targets(maps, targets), targets, model.config.head.classes, model.config.loss)
+
+
 def test_iou_losses_of_a_class_by_hand(threads: None) -> None:
     """One positive anchor: 1 - IoU = 2/5, 1 - GIoU, and the branch, whose target is the IoU of 3/5."""
     entry = load_config(CONFIGS / "demo.yaml").head.classes[0]
@@ -80,13 +97,15 @@ def test_iou_losses_of_a_class_by_hand(threads: None) -> None:
     location[..., 0::2] = 1.0
     location[..., 1::2] = 0.5  # the box stands at (1, 0.5): 4 x 1.5 of 4 x 2.5 are shared
     maps = HeadMaps(torch.zeros(1, 2), location, torch.zeros(1, 2, 2), None, torch.tensor([[2.0, -3.0]]))
+    (found,) = at_targets([maps], targets)
     weights = LossConfig(localization=2.0, iou=3.0)
-    terms = total_loss([maps], targets, [entry], dataclasses.replace(weights, box="iou"))
+    terms = total_loss([maps.logits], [found], targets, [entry], dataclasses.replace(weights, box="iou"))
     assert terms["localization"].item() == pytest.approx(2.0 * (1 - 6 / 10), abs=1e-5)
     branch = math.log(1 + math.exp(2.0)) - 2.0 * 6 / 10  # cross-entropy of the logit 2 with the target 0.6
     assert terms["iou"].item() == pytest.approx(3.0 * branch, abs=1e-5)
     location[..., 0::2] = 3.0  # at (3, 0.5): 2 x 1.5 shared, 13 covered, 6 x 2.5 enclosed
-    terms = total_loss([maps], targets, [entry], dataclasses.replace(weights, box="giou"))
+    (found,) = at_targets([maps], targets)
+    terms = total_loss([maps.logits], [found], targets, [entry], dataclasses.replace(weights, box="giou"))
     assert terms["localization"].item() == pytest.approx(2.0 * (1 - (3 / 13 - 2 / 15)), abs=1e-5)
 
 
@@ -104,8 +123,8 @@ def test_learnt_weights_by_hand(threads: None) -> None:
     with torch.no_grad():
         for k, name in enumerate(model.log_variances):
             model.log_variances[name].fill_(0.5 * k)
-    terms = plain.loss(plain(points, sample, 1), boxes, labels)
-    weighed = model.loss(model(points, sample, 1), boxes, labels)
+    terms = plain(points, sample, boxes, labels)
+    weighed = model(points, sample, boxes, labels)
     for k, name in enumerate(model.log_variances):
         assert weighed[name].item() == pytest.approx(math.exp(-0.5 * k) * terms[name].item() + 0.5 * k, rel=1e-5)
     torch.stack(list(weighed.values())).sum().backward()
@@ -129,20 +148,21 @@ def test_loss_of_a_class_by_hand(demo: Config, threads: None) -> None:
     targets = match_class(anchors, [torch.tensor([[0.0, 0, 0.3, 4, 2, 1.5, 0]])], 0.5, 0.35)
     assert targets.positive.tolist() == [[True, True, False]]
     maps = HeadMaps(torch.zeros(1, 3), torch.zeros(1, 3, 8), torch.zeros(1, 3, 2), torch.zeros(1, 3, 2))
-    terms = total_loss([maps], targets, [entry], LossConfig())
+    found = at_targets([maps], targets)
+    terms = total_loss([maps.logits], found, targets, [entry], LossConfig())
     assert terms["classification"].item() == pytest.approx(3 * 0.5 * math.log(2) / 2)
     assert terms["localization"].item() == pytest.approx(4 * 0.5 * 0.1**2 / 2)  # four x offsets of -0.1 m
     assert terms["vertical"].item() == pytest.approx(1.5 * 2 * 0.5 * 0.2**2 / 2)
     assert terms["direction"].item() == pytest.approx(0.2 * math.log(2))
-    terms = total_loss([maps], targets, [entry], LossConfig(beta=0.05))  # from 0.05 on linear
+    terms = total_loss([maps.logits], found, targets, [entry], LossConfig(beta=0.05))  # from 0.05 on linear
     assert terms["localization"].item() == pytest.approx(4 * (0.1 - 0.025) / 2)
     assert terms["vertical"].item() == pytest.approx(1.5 * 2 * (0.2 - 0.025) / 2)
 
 
 def test_loss_without_boxes_is_finite(demo: Config, threads: None) -> None:
     model = HVNet(demo)
-    maps = model(some_points(), torch.zeros(500, dtype=torch.int64), 1)
-    terms = model.loss(maps, [torch.zeros(0, 7)], [torch.zeros(0, dtype=torch.int64)])
+    none = [torch.zeros(0, 7)], [torch.zeros(0, dtype=torch.int64)]
+    terms = model(some_points(), torch.zeros(500, dtype=torch.int64), *none)
     loss = torch.stack(list(terms.values())).sum()
     loss.backward()
     assert loss.isfinite()
@@ -173,13 +193,14 @@ def test_losses_are_the_sums_of_those_of_the_classes(box: str, regression: str, 
     model, maps, boxes, labels = losses_of(demo, box, regression)
     labels = [of_own.where(of_own != 1, -1) for of_own in labels]
     leaves = [[part.requires_grad_() for part in of_class] for of_class in maps]
-    found = model.loss([HeadMaps(*of_class) for of_class in leaves], boxes, labels)
+    found = loss_of_maps(model, [HeadMaps(*of_class) for of_class in leaves], boxes, labels)
     want: dict[str, Tensor] = {}
     for k, entry in enumerate(demo.head.classes):
         own = [each[of_each == k] for each, of_each in zip(boxes, labels, strict=True)]
         thresholds = (entry.positive_iou, entry.negative_iou)
         targets = match_class(model.anchors(k), own, *thresholds, regression=regression)
-        terms = total_loss([HeadMaps(*leaves[k])], targets, [entry], model.config.loss)
+        rows = at_targets([HeadMaps(*leaves[k])], targets)
+        terms = total_loss([leaves[k][0]], rows, targets, [entry], model.config.loss)
         want = {name: want[name] + term if want else term for name, term in terms.items()}
     assert found == want
     assert all(term > 0 for term in found.values())
@@ -199,7 +220,7 @@ def test_losses_of_many_threads_are_those_of_one(
 
     def terms_and_gradients() -> tuple[dict[str, Tensor], list[Tensor]]:
         leaves = [part.clone().requires_grad_() for of_class in maps for part in of_class]
-        terms = model.loss([HeadMaps(*leaves[k : k + 5]) for k in (0, 5, 10)], boxes, labels)
+        terms = loss_of_maps(model, [HeadMaps(*leaves[k : k + 5]) for k in (0, 5, 10)], boxes, labels)
         return terms, list(torch.autograd.grad(torch.stack(list(terms.values())).sum(), leaves))
 
     terms, gradients = terms_and_gradients()

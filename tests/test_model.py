@@ -23,7 +23,7 @@ def test_shapes_of_every_stage(demo: Config) -> None:
     assert [b.shape for b in stream] == [(2, 16, 32, 16), (2, 32, 16, 8), (2, 64, 8, 4)]
     levels = model.backbone.pyramid(stream)
     assert [level.shape for level in levels] == [(2, 32, 32, 16), (2, 32, 16, 8), (2, 32, 8, 4)]
-    maps = model(points, sample, 2)
+    maps = model.maps(points, sample, 2)
     for k, (of_class, entry) in enumerate(zip(maps, demo.head.classes, strict=True)):
         anchors = 4 * (32 >> entry.level) * (16 >> entry.level)
         assert model.anchors(k).shape == (anchors, 7)
@@ -45,7 +45,7 @@ def test_one_to_five_projection_scales(scales: int) -> None:
     ]
     config = load_config(CONFIGS / "demo.yaml", changes)
     model = HVNet(config)
-    maps = model(some_points(), torch.zeros(500, dtype=torch.int64), 1)
+    maps = model.maps(some_points(), torch.zeros(500, dtype=torch.int64), 1)
     for k, of_class in enumerate(maps):
         assert of_class.logits.shape == (1, len(model.anchors(k)))
 
@@ -158,7 +158,7 @@ def test_flipped_scene_gives_flipped_detections(demo: Config, direction: bool) -
         if isinstance(module, torch.nn.Conv2d) and module.stride == (2, 2):
             torch.nn.init.zeros_(module.weight[..., 0])
     points = some_points(800)
-    model(points, torch.zeros(800, dtype=torch.int64), 1)
+    model.maps(points, torch.zeros(800, dtype=torch.int64), 1)
     sample = torch.zeros(800, dtype=torch.int64)
     found = by_score(model.eval().detect(points, sample, 1)[0])
     flipped = points * torch.tensor([1.0, -1.0, 1.0, 1.0])
@@ -194,10 +194,10 @@ def test_batch_of_samples_is_each_alone(demo: Config) -> None:
     model = HVNet(demo).eval()
     points, sample = some_points(), (torch.arange(500) * 3) // 500
     with torch.no_grad():
-        together = model(points, sample, 3)
+        together = model.maps(points, sample, 3)
         for b in range(3):
             own = points[sample == b]
-            alone = model(own, torch.zeros(len(own), dtype=torch.int64), 1)
+            alone = model.maps(own, torch.zeros(len(own), dtype=torch.int64), 1)
             for a, t in zip(alone, together, strict=True):
                 torch.testing.assert_close(a.logits[0], t.logits[b], rtol=1e-4, atol=1e-4)
                 torch.testing.assert_close(a.location[0], t.location[b], rtol=1e-4, atol=1e-4)

@@ -38,7 +38,7 @@ def one_step(batch: list[int]) -> tuple[dict[str, Tensor], dict[str, float]]:
     joint = ranks.wrap_ddp(model)
     points, boxes, labels = zip(*(cloud(b) for b in batch), strict=True)
     sample = torch.repeat_interleave(torch.arange(len(batch)), torch.tensor([len(p) for p in points]))
-    terms = model.loss(joint(torch.cat(points), sample, len(batch)), list(boxes), list(labels))
+    terms = joint(torch.cat(points), sample, list(boxes), list(labels))
     loss = torch.stack(list(terms.values())).sum()
     (ranks.size() * loss).backward()
     tensors = {

@@ -39,7 +39,7 @@ from hvnet.network.backbone import ConvReLU
 from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint
 from hvnet.network.devices import select_device
 from hvnet.network.fused import inference, is_fused
-from hvnet.network.head import LOCATION_VALUES, Head, scores_of
+from hvnet.network.head import LOCATION_VALUES, Head, regress, scores_of, weight_of
 from hvnet.network.model import Detections, HVNet
 from hvnet.network.static import COLUMNS, BoxSteps, Rows, StaticFrame, capacity_of
 
@@ -306,7 +306,9 @@ class Detector:
         chosen = (scores > head.score_threshold).nonzero().squeeze(1)
         chosen = chosen[torch.sort(scores[chosen], descending=True, stable=True).indices[: head.candidates]]
         scores = scores[chosen]
-        values = regress(levels[entry.level][b], chosen, self.regression_weights[label], anchors_per_cell(entry))
+        values = regress(
+            levels[entry.level][b : b + 1], chosen, self.regression_weights[label], anchors_per_cell(entry)
+        )
         count = LOCATION_VALUES[head.regression]
         direction = values[:, count + 2 :].argmax(dim=1) if head.direction else None
         boxes = decode(values[:, :count], values[:, count : count + 2], direction, self.anchors[label][chosen])
@@ -366,33 +368,9 @@ def fold_batch_norms(module: nn.Module) -> nn.Module:
 
 
 def regression_weight(head: Head) -> Tensor:
-    """The branches of a head that regress as one matrix (9 C + 1, N_anc * values): 3 x 3 cells, then the bias."""
+    """The branches of a head that make a box as the matrix of `weight_of`."""
     branches = [branch for branch in (head.location, head.vertical, head.direction) if branch is not None]
-    anchors = head.score.weight.shape[0]
-    parts = []
-    for branch in branches:
-        assert branch.bias is not None
-        weight = branch.weight.permute(2, 3, 1, 0).flatten(0, 2)  # (9 C, N_anc * values)
-        whole = torch.cat((weight, branch.bias[None]))
-        parts.append(whole.view(len(whole), anchors, -1))
-    return torch.cat(parts, dim=2).flatten(1).detach().float()
-
-
-def regress(level: Tensor, chosen: Tensor, weight: Tensor, anchors: int) -> Tensor:
-    """The outputs of a head's 3 x 3 convolutions for the chosen anchors (K,) of a level (C, N_L, N_W): (K, values)."""
-    channels, n_l, n_w = level.shape
-    rows = level.permute(1, 2, 0).reshape(-1, channels)
-    cell = chosen // anchors
-    step = torch.arange(-1, 2, device=chosen.device)
-    x = (cell // n_w)[:, None, None] + step[:, None]
-    y = (cell % n_w)[:, None, None] + step
-    inside = (x >= 0) & (x < n_l) & (y >= 0) & (y < n_w)
-    patches = rows[(x.clamp(0, n_l - 1) * n_w + y.clamp(0, n_w - 1)).flatten()].float().view(len(chosen), 9, channels)
-    patches = patches * inside.view(len(chosen), 9, 1)
-    values = torch.addmm(weight[-1], patches.flatten(1), weight[:-1]).view(
-        len(chosen), anchors, weight.shape[1] // anchors
-    )
-    return values[torch.arange(len(chosen), device=chosen.device), chosen % anchors]
+    return weight_of(branches, head.score.out_channels).detach()
 
 
 def _is_number(value: object) -> bool:

@@ -1,6 +1,7 @@
 """Detection head (Sec. 3.5): parallel 3x3 convolutions on a class's pyramid level."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -26,6 +27,15 @@ class HeadMaps(NamedTuple):
         return HeadMaps(*(None if part is None else part[b] for part in self))  # type: ignore[arg-type]
 
 
+class Regressed(NamedTuple):
+    """What the branches but the score's give for P anchors: in training for the positive ones alone."""
+
+    location: Tensor  # (P, 8) or (P, 5)
+    vertical: Tensor  # (P, 2)
+    direction: Tensor | None  # (P, 2) logits
+    iou: Tensor | None  # (P,) logits
+
+
 LOCATION_VALUES = {"corners": 8, "pose": 5}
 
 
@@ -46,15 +56,63 @@ class Head(nn.Module):
         self.iou = branch(1) if config.iou else None
         nn.init.constant_(self.score.bias, -math.log((1 - PRIOR) / PRIOR))  # type: ignore[arg-type]
 
+    def logits(self, level: Tensor) -> Tensor:
+        """The class's pyramid level (B, C, N_L, N_W) to the logits (B, A) of its A = N_L * N_W * N_anc anchors."""
+        return anchor_rows(self.score(level), 1).squeeze(-1)
+
+    def regress(self, level: Tensor, chosen: Tensor) -> Regressed:
+        """What the other branches give for the chosen ones (P,) of the B * A anchors of a level (B, C, N_L, N_W)."""
+        optional = [branch for branch in (self.direction, self.iou) if branch is not None]
+        branches = [self.location, self.vertical, *optional]
+        anchors = self.score.out_channels
+        values = regress(level, chosen, weight_of(branches, anchors), anchors)
+        sizes = [branch.out_channels // anchors for branch in branches]
+        location, vertical, *rest = values.split(sizes, dim=1)
+        direction = None if self.direction is None else rest.pop(0)
+        return Regressed(location, vertical, direction, None if self.iou is None else rest.pop(0).squeeze(1))
+
     def forward(self, level: Tensor) -> HeadMaps:
-        """The class's pyramid level (B, C, N_L, N_W) to the outputs for its N_L * N_W * N_anc anchors."""
+        """The class's pyramid level (B, C, N_L, N_W) to the outputs for all of its anchors."""
         return HeadMaps(
-            anchor_rows(self.score(level), 1).squeeze(-1),
+            self.logits(level),
             anchor_rows(self.location(level), self.location.out_channels // self.score.out_channels),
             anchor_rows(self.vertical(level), 2),
             None if self.direction is None else anchor_rows(self.direction(level), 2),
             None if self.iou is None else anchor_rows(self.iou(level), 1).squeeze(-1),
         )
+
+
+def weight_of(branches: Sequence[nn.Conv2d], anchors: int) -> Tensor:
+    """Branches of a head as one matrix (9 C + 1, N_anc * values) float32: 3 x 3 cells, then the bias."""
+    parts = []
+    for branch in branches:
+        assert branch.bias is not None
+        weight = branch.weight.permute(2, 3, 1, 0).flatten(0, 2)  # (9 C, N_anc * values)
+        whole = torch.cat((weight, branch.bias[None]))
+        parts.append(whole.view(len(whole), anchors, -1))
+    return torch.cat(parts, dim=2).flatten(1).float()
+
+
+def regress(level: Tensor, chosen: Tensor, weight: Tensor, anchors: int) -> Tensor:
+    """The outputs of a head's 3 x 3 convolutions for the chosen ones (K,) of the anchors of a level (B, C, N_L, N_W).
+
+    weight: of `weight_of`. Returns (K, values) float32.
+    """
+    batch_size, channels, n_l, n_w = level.shape
+    rows = level.permute(0, 2, 3, 1).reshape(-1, channels)
+    cell = chosen // anchors
+    step = torch.arange(-1, 2, device=chosen.device)
+    x = (cell // n_w % n_l)[:, None, None] + step[:, None]
+    y = (cell % n_w)[:, None, None] + step
+    inside = (x >= 0) & (x < n_l) & (y >= 0) & (y < n_w)
+    first = (cell // (n_l * n_w) * n_l)[:, None, None]  # the first row of cells of the sample
+    at = (first + x.clamp(0, n_l - 1)) * n_w + y.clamp(0, n_w - 1)
+    patches = rows.index_select(0, at.flatten()).float().view(len(chosen), 9, channels)
+    patches = patches * inside.view(len(chosen), 9, 1)
+    values = torch.addmm(weight[-1], patches.flatten(1), weight[:-1]).view(
+        len(chosen), anchors, weight.shape[1] // anchors
+    )
+    return values[torch.arange(len(chosen), device=chosen.device), chosen % anchors]
 
 
 def scores_of(logits: Tensor, iou: Tensor | None) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 from hvnet.boxes import bev_corners
 from hvnet.config import ClassConfig, LossConfig
 from hvnet.network.anchors import Targets, decode
-from hvnet.network.head import HeadMaps
+from hvnet.network.head import Regressed
 from hvnet.ranks import all_reduce
 
 IGNORED = -100  # the direction of an unused row
@@ -24,13 +24,20 @@ def focal_loss(logits: Tensor, positive: Tensor, negative: Tensor, alpha: float,
 
 
 def total_loss(
-    maps: Sequence[HeadMaps], targets: Targets, classes: Sequence[ClassConfig], weights: LossConfig
+    logits: Sequence[Tensor],
+    found: Sequence[Regressed],
+    targets: Targets,
+    classes: Sequence[ClassConfig],
+    weights: LossConfig,
 ) -> dict[str, Tensor]:
     """The weighted terms summed over the classes, each divided by max(1, positives of its class in the batch of all
-    ranks)."""
-    sizes, anchors = [len(rows) for rows in targets.rows], [own.logits.shape[1] for own in maps]
-    used, location = ~targets.unused, rows_of([own.location for own in maps], targets)
-    vertical = rows_of([own.vertical for own in maps], targets)
+    ranks).
+
+    Of every class: logits (B, A_k), and what was found for the rows of the targets.
+    """
+    sizes, anchors = [len(rows) for rows in targets.rows], [own.shape[1] for own in logits]
+    used, location = ~targets.unused, joined([own.location for own in found], targets)
+    vertical = joined([own.vertical for own in found], targets)
 
     def by_class(loss: Callable[..., Tensor], *rows: Tensor) -> list[Tensor]:
         """The loss of every class's rows, of all rows (P, ...).
@@ -50,32 +57,32 @@ def total_loss(
         box = by_class(torch.sum, (1 - overlap(weights.box == "giou")).masked_fill(targets.unused, 0.0))
     terms = {
         "classification": [
-            focal_loss(own.logits, positive, negative, entry.focal_alpha, entry.focal_gamma)
-            for own, positive, negative, entry in zip(maps, *masks, classes, strict=True)
+            focal_loss(own, positive, negative, entry.focal_alpha, entry.focal_gamma)
+            for own, positive, negative, entry in zip(logits, *masks, classes, strict=True)
         ],
         "localization": box,
         "vertical": by_class(smooth_l1, vertical, targets.vertical),
     }
-    directions = [own.direction for own in maps if own.direction is not None]
+    directions = [own.direction for own in found if own.direction is not None]
     if directions:
         bins = targets.direction.masked_fill(targets.unused, IGNORED)
         cross_entropy = functools.partial(F.cross_entropy, reduction="sum", ignore_index=IGNORED)
-        terms["direction"] = by_class(cross_entropy, rows_of(directions, targets), bins)
-    ious = [own.iou for own in maps if own.iou is not None]
+        terms["direction"] = by_class(cross_entropy, joined(directions, targets), bins)
+    ious = [own.iou for own in found if own.iou is not None]
     if ious:
         with torch.no_grad():
             wanted = overlap()
         cross_entropy = functools.partial(F.binary_cross_entropy_with_logits, reduction="sum")
-        terms["iou"] = by_class(cross_entropy, rows_of(ious, targets), wanted, used.float())
+        terms["iou"] = by_class(cross_entropy, joined(ious, targets), wanted, used.float())
     positives = all_reduce(torch.stack(by_class(torch.sum, used))).clamp(min=1)
     weighted = torch.stack([getattr(weights, name) * torch.stack(of_classes) for name, of_classes in terms.items()])
     totals = functools.reduce(torch.add, (weighted / positives).unbind(1))
     return dict(zip(terms, totals.unbind(), strict=True))
 
 
-def rows_of(maps: Sequence[Tensor], targets: Targets) -> Tensor:
-    """The rows (P, ...) of the maps (B, A_k, ...); unused ones are 0, as their targets are, and pass no gradient on."""
-    rows = torch.cat([own.flatten(0, 1)[picked] for own, picked in zip(maps, targets.rows, strict=True)])
+def joined(parts: Sequence[Tensor], targets: Targets) -> Tensor:
+    """The rows (P, ...) of all classes; unused ones are 0, as their targets are, and pass no gradient on."""
+    rows = torch.cat(list(parts))
     return rows.masked_fill(targets.unused if rows.ndim == 1 else targets.unused[:, None], 0.0)
 
 

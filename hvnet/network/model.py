@@ -1,7 +1,7 @@
-"""HVNet: encoder, backbone and one head a class; `forward` returns maps, `detect` returns boxes."""
+"""HVNet: encoder, backbone and one head a class; `forward` returns the loss, `detect` boxes."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -63,24 +63,42 @@ class HVNet(nn.Module):
         self.anchors = Anchors([make_anchors(config, entry) for entry in classes], classes, per_box)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def forward(self, points: Tensor, sample: Tensor, batch_size: int) -> list[HeadMaps]:
+    def forward(self, points: Tensor, sample: Tensor, boxes: list[Tensor], labels: list[Tensor]) -> dict[str, Tensor]:
+        """Points (N, 4) of samples (N,), boxes (M_b, 7) and labels (M_b,) of every sample to the terms of the loss."""
+        return self.loss(self.levels(self.encoder(points, sample, len(boxes))), boxes, labels)
+
+    def levels(self, images: list[Tensor]) -> list[Tensor]:
+        """Pseudo-images, finest first, to the levels of the pyramid (B, C, N_L, N_W) / 2^k."""
+        with self.autocast(images[0].device):
+            return self.backbone(images)
+
+    def maps(self, points: Tensor, sample: Tensor, batch_size: int) -> list[HeadMaps]:
         """Points (N, 4) of samples (N,) to the maps of every class."""
         return self.maps_of(self.encoder(points, sample, batch_size))
 
     def maps_of(self, images: list[Tensor]) -> list[HeadMaps]:
         """Pseudo-images, finest first, to the maps of every class."""
-        bfloat16 = self.config.train.bfloat16 and self.training
-        with torch.autocast(images[0].device.type, torch.bfloat16, enabled=bfloat16):
-            levels = self.backbone(images)
+        levels = self.levels(images)
+        with self.autocast(images[0].device):
             return [head(levels[entry.level]) for head, entry in zip(self.heads, self.config.head.classes, strict=True)]
 
-    def loss(self, maps: list[HeadMaps], boxes: list[Tensor], labels: list[Tensor]) -> dict[str, Tensor]:
+    def autocast(self, device: torch.device) -> torch.autocast:
+        """In bfloat16 where a model is trained so."""
+        return torch.autocast(device.type, torch.bfloat16, enabled=self.config.train.bfloat16 and self.training)
+
+    def loss(self, levels: list[Tensor], boxes: list[Tensor], labels: list[Tensor]) -> dict[str, Tensor]:
         """Eq. 5: the terms summed over classes, for the boxes (M_b, 7) and labels (M_b,) of every sample.
 
-        With learnt weights a term L is exp(-s) L + s, s the logarithm of its variance (Kendall et al., CVPR 2018).
+        Only positive anchors have a box to learn, so that only theirs is calculated. With learnt weights a term L is
+        exp(-s) L + s, s the logarithm of its variance (Kendall et al., CVPR 2018).
         """
         targets = assign_targets(self.anchors, boxes, labels, self.config.head.regression)
-        total = total_loss(maps, targets, self.config.head.classes, self.config.loss)
+        heads = [cast(Head, head) for head in self.heads]
+        at = [levels[entry.level] for entry in self.config.head.classes]
+        with self.autocast(levels[0].device):
+            logits = [head.logits(level) for head, level in zip(heads, at, strict=True)]
+        found = [head.regress(level, rows) for head, level, rows in zip(heads, at, targets.rows, strict=True)]
+        total = total_loss(logits, found, targets, self.config.head.classes, self.config.loss)
         for name, s in self.log_variances.items():
             total[name] = (-s).exp() * total[name] + s
         return total
@@ -93,7 +111,7 @@ class HVNet(nn.Module):
         """
         if self.training:
             raise RuntimeError("detect: the model is in training mode; call eval() first")
-        maps = self(points, sample, batch_size)
+        maps = self.maps(points, sample, batch_size)
         samples = []
         for b in range(batch_size):
             parts = [self._detect_class(label, of_class.of_sample(b)) for label, of_class in enumerate(maps)]

@@ -208,8 +208,7 @@ class Run:
         print_once(batch.notes, self.seen)
         batch = batch.to(self.device)
         statistics = {name: model.get_buffer(name).clone() for name in self.statistics}
-        maps = self.joint(batch.points, batch.sample, len(batch.boxes))
-        terms = model.loss(maps, batch.boxes, batch.labels)
+        terms = self.joint(batch.points, batch.sample, batch.boxes, batch.labels)
         loss = torch.stack(list(terms.values())).sum()
         self.optimizer.zero_grad(set_to_none=True)
         (ranks.size() * loss).backward()  # the ranks' gradients are averaged, the loss is their sum
