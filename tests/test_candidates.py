@@ -11,7 +11,7 @@ from hvnet.config import Config, load_config
 from hvnet.kernels.candidates import gather_patches, write_keys
 from hvnet.network.anchors import MAX_HEIGHT, decode, make_anchors
 from hvnet.network.detector import regression_weight
-from hvnet.network.head import Head, scores_of
+from hvnet.network.head import Head, regress, scores_of
 from hvnet.network.static import BoxSteps
 from tests.models import CONFIGS, NARROW
 

@@ -98,7 +98,7 @@ def regress(level: Tensor, chosen: Tensor, weight: Tensor, anchors: int) -> Tens
 
     weight: of `weight_of`. Returns (K, values) float32.
     """
-    batch_size, channels, n_l, n_w = level.shape
+    _, channels, n_l, n_w = level.shape
     rows = level.permute(0, 2, 3, 1).reshape(-1, channels)
     cell = chosen // anchors
     step = torch.arange(-1, 2, device=chosen.device)
