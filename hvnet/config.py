@@ -140,6 +140,7 @@ class TrainConfig:
     decay_ratio: float = 0.1
     cosine: bool = False  # after the warm-up half a cosine down to zero, instead of the steps at decay_epochs
     repeat: int = 1  # passes over the frames in an epoch, augmented differently each time
+    drives: str = ""  # CSV file in the data's folder with the columns frame and drive: long drives are weighed down
     gradient_clip: float = 10.0  # largest norm of the gradient
     validate_every: int = 10  # epochs; the last epoch is always validated
     report_every: int = 1  # steps; between reports a GPU is not waited for

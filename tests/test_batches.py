@@ -57,6 +57,51 @@ def test_order_of_an_epoch() -> None:
     assert [len(batch) for batch in EpochOrder(3, 4, seed=0)] == [3]  # unless there are no others
 
 
+def test_frames_of_long_drives_are_drawn_less_often() -> None:
+    """A drive of n frames sqrt(n) times as often as one of one; each frame as often as expected, but for one."""
+    drives = ["a"] * 16 + ["b"] * 4 + ["c"]  # of 4 + 2 + 1 parts
+    expected = np.array([4 / 16] * 16 + [2 / 4] * 4 + [1]) * 63 / 7
+    order = EpochOrder(63, 3, seed=0, drives=drives)
+    epochs = []
+    for order.epoch in range(100):
+        items = [item for batch in order for item in batch]
+        assert len(items) == len(set(items)) == 63
+        assert {epoch for epoch, _ in items} == {order.epoch}
+        counts = np.bincount([k % 21 for _, k in items], minlength=21)
+        assert (np.abs(counts - expected) < 1).all()
+        for k, count in enumerate(counts):  # augmented differently each time
+            assert {item // 21 for _, item in items if item % 21 == k} == set(range(count))
+        epochs.append(items)
+    mean = np.mean([np.bincount([k % 21 for _, k in items], minlength=21) for items in epochs], axis=0)
+    assert np.abs(mean - expected).max() < 0.1
+    assert [k for _, k in epochs[0]] != sorted(k for _, k in epochs[0])
+    assert [k for _, k in epochs[0]] != [k for _, k in epochs[1]]
+    order.begin = 5
+    assert [item for batch in order for item in batch] == epochs[-1][15:]
+
+
+def test_sectors_come_from_frames_of_long_drives_less_often(scenes: Path, tiny: Config) -> None:
+    mixed = dataclasses.replace(tiny, augment=dataclasses.replace(tiny.augment, mix=1.0, objects={}))
+    frames = TrainingFrames(KittiFrames(scenes, IDS), mixed, None, CPU, drives=["a", "a", "b"])
+    read, plain = [], frames.read
+
+    def noted(k: int) -> Sample:
+        read.append(k)
+        return plain(k)
+
+    frames.read = noted  # type: ignore[method-assign]
+    for k in range(0, 600, 3):
+        frames[0, k]
+    shares = np.bincount(read[1::2], minlength=3) / 200
+    np.testing.assert_allclose(shares, np.array([1, 1, 2**0.5]) / (2 + 2**0.5), atol=0.07)
+
+
+def test_a_drive_for_every_frame(scenes: Path) -> None:
+    frames = KittiFrames(scenes, IDS)
+    with pytest.raises(ValueError, match="drives: want one for each of 3 training frames, got 2"):
+        Data(frames, frames, drives=["a", "b"])
+
+
 def test_ranks_share_a_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = list(EpochOrder(8, 4, seed=0))
     monkeypatch.setattr("hvnet.ranks.size", lambda: 2)

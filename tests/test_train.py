@@ -196,6 +196,29 @@ def test_resuming_a_finished_run_changes_nothing(scenes: Path, begun: Path) -> N
     assert {name: after[name] for name in before} == before
 
 
+def test_drives(copied: Path, tmp_path: Path) -> None:
+    """A run that draws by drives goes on to the same bits, but not with other drives."""
+    file = copied / "drives.csv"
+    file.write_text("frame,drive\n000000,a\n000001,b\n000002,b\n000003,b\n")
+    changes = ["train.drives=drives.csv", "augment.mix=0.5", "train.repeat=2"]
+    run(copied, tmp_path / "whole", *changes)
+    run(copied, tmp_path / "out", *changes, "train.epochs=1")
+    run(copied, tmp_path / "out", *changes, resume=True)
+    mine, want = (load_checkpoint(tmp_path / name / "checkpoint.pt") for name in ("out", "whole"))
+    assert same(mine, want)
+    run(copied, tmp_path / "other", *changes[1:])
+    assert metrics(tmp_path / "other")[0]["loss"] != metrics(tmp_path / "whole")[0]["loss"]
+    with pytest.raises(InputError, match=r"another train\.drives"):
+        run(copied, tmp_path / "out", *changes[1:], resume=True)
+    file.write_text(file.read_text().replace("000001,b", "000001,a"))
+    with pytest.raises(InputError, match="was trained on other frames or drives"):
+        run(copied, tmp_path / "out", *changes, resume=True)
+    file.unlink()
+    with pytest.raises(InputError, match=r"drives\.csv: no such file"):
+        run(copied, tmp_path / "none", *changes)
+    assert not (tmp_path / "none").exists()
+
+
 def test_frames_that_changed_since_are_said(copied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Once, and the run goes on with them as they are; a file that was only touched is no change."""
     out, training = tmp_path / "out", copied / "training"
@@ -776,7 +799,7 @@ def test_a_mistake_in_a_validation_file_is_found_before_the_first_epoch(copied: 
 
 def test_other_frames_are_not_resumed(copied: Path, begun: Path) -> None:
     (copied / "ImageSets" / "train.txt").write_text("000000\n000001\n000002\n")
-    with pytest.raises(InputError, match="was trained on other frames"):
+    with pytest.raises(InputError, match="was trained on other frames or drives"):
         run(copied, begun, resume=True)
 
 

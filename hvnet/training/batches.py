@@ -17,6 +17,7 @@ from tqdm import tqdm
 from hvnet import ranks
 from hvnet.config import Config
 from hvnet.data.augment import ObjectSampler, augment, mix_sectors, send
+from hvnet.data.drives import drive_weights, read_drives
 from hvnet.data.frame import Frame, Frames, check_names, frame_at, object_names
 from hvnet.data.gt_database import Database, build_database, load_database
 from hvnet.data.kitti import KittiFrames, read_split_frames
@@ -46,12 +47,18 @@ class Data:
     train: Frames
     val: Frames
     root: Path | None = None  # their KITTI root, where the ground-truth database is kept
+    drives: Sequence[str] = ()  # of each training frame, if frames of long drives are to be drawn less often
+
+    def __post_init__(self) -> None:
+        if self.drives and len(self.drives) != len(self.train):
+            raise ValueError(f"drives: want one for each of {len(self.train)} training frames, got {len(self.drives)}")
 
 
 def kitti_data(root: Path, config: Config) -> Data:
-    """The frames of the config's splits in a KITTI root."""
-    train, val = config.train.train_split, config.train.val_split
-    return Data(read_split_frames(root, train, config.data), read_split_frames(root, val, config.data), root)
+    """The frames of the config's splits in a KITTI root, and the drives of the training frames if it names a file."""
+    train = read_split_frames(root, config.train.train_split, config.data)
+    val = read_split_frames(root, config.train.val_split, config.data)
+    return Data(train, val, root, read_drives(root / config.train.drives, train.names) if config.train.drives else ())
 
 
 def generated_scenes(config: Config, folder: Path) -> Path:
@@ -104,8 +111,16 @@ class TrainingFrames(Dataset[Sample | InputError]):
     A mistake in a file is returned, not raised: a worker process would wrap it in the text of its traceback.
     """
 
-    def __init__(self, frames: Frames, config: Config, objects: ObjectSampler | None, device: torch.device) -> None:
+    def __init__(
+        self,
+        frames: Frames,
+        config: Config,
+        objects: ObjectSampler | None,
+        device: torch.device,
+        drives: Sequence[str] = (),
+    ) -> None:
         self.frames, self.config, self.objects, self.device = frames, config, objects, device
+        self.weights = drive_weights(drives)
         self.classes = [entry.name for entry in config.head.classes]
         self.kept: dict[int, Sample] = {}
 
@@ -122,7 +137,11 @@ class TrainingFrames(Dataset[Sample | InputError]):
         frame = self.read(k % len(self.frames))
         points, boxes, labels, note = frame.points, frame.boxes, frame.labels, frame.note
         if options.mix and torch.rand((), generator=generator).item() < options.mix:
-            other = self.read(int(torch.randint(len(self.frames), (), generator=generator)))
+            if len(self.weights):
+                drawn = torch.multinomial(self.weights, 1, generator=generator)
+            else:
+                drawn = torch.randint(len(self.frames), (), generator=generator)
+            other = self.read(int(drawn))
             others = (other.points, other.boxes, other.labels)
             points, boxes, labels = mix_sectors(points, boxes, labels, others, generator)
             note = "\n".join(filter(None, (note, other.note)))
@@ -169,20 +188,38 @@ class TrainingFrames(Dataset[Sample | InputError]):
 class EpochOrder(Sampler[list[tuple[int, int]]]):
     """Batches of items (epoch, k), shuffled by seed and epoch: of each, from the batch `begin` on, a rank's share.
 
-    The last frames of an epoch that do not fill a batch are left out, unless there are no others.
+    The last frames of an epoch that do not fill a batch are left out, unless there are no others. Where the frames (N,)
+    have drives, `count` of them are drawn by `drive_weights` instead of each equally often.
     """
 
-    def __init__(self, count: int, batch_size: int, seed: int) -> None:
+    def __init__(self, count: int, batch_size: int, seed: int, drives: Sequence[str] = ()) -> None:
         self.count, self.batch_size, self.seed, self.epoch, self.begin = count, batch_size, seed, 0, 0
+        self.weights = drive_weights(drives)
 
     def __len__(self) -> int:
         return max(1, self.count // self.batch_size)
 
     def __iter__(self) -> Iterator[list[tuple[int, int]]]:
-        order = torch.randperm(self.count, generator=seeded(self.seed, self.epoch)).tolist()
+        generator = seeded(self.seed, self.epoch)
+        order = torch.randperm(self.count, generator=generator)
+        if len(self.weights):
+            order = draw_items(self.weights, self.count, generator)[order]
         for batch in range(self.begin, len(self)):
-            items = order[batch * self.batch_size : (batch + 1) * self.batch_size]
+            items = order[batch * self.batch_size : (batch + 1) * self.batch_size].tolist()
             yield [(self.epoch, k) for k in items[ranks.rank() :: ranks.size()]]
+
+
+def draw_items(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Draws frames (N,) in proportion to their weights, each as often as expected, rounded up or down by chance.
+
+    Returns items (count,): N * d + k for frame k and d = 0, 1, ... each time that it is drawn, so that no item is there
+    twice. This is systematic sampling: a comb of equal teeth, moved at random, over the weights laid end to end.
+    """
+    ends = weights.cumsum(0)
+    teeth = (torch.arange(count) + torch.rand((), generator=generator, dtype=torch.float64)) * (ends[-1] / count)
+    frames = torch.searchsorted(ends, teeth, right=True).clamp(max=len(weights) - 1)
+    draw = torch.arange(count) - torch.searchsorted(frames, frames)
+    return frames + len(weights) * draw
 
 
 def seeded(*numbers: int) -> torch.Generator:

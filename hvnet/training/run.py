@@ -109,9 +109,8 @@ class Run:
             raise InputError(f"{out}: holds a run; resume it, or give another folder")
         with deterministic():
             torch.manual_seed(config.train.seed)  # torch's own generator: it goes into the checkpoints
-            self.frames_id = hashlib.sha256(
-                json.dumps([list(data.train.names), list(data.val.names)]).encode()
-            ).hexdigest()
+            known = [list(data.train.names), list(data.val.names), list(data.drives)]
+            self.frames_id = hashlib.sha256(json.dumps(known if data.drives else known[:2]).encode()).hexdigest()
             if resume:  # before anything is written
                 self.check_checkpoint()
             self.loader = self.make_loader()
@@ -153,7 +152,7 @@ class Run:
         if ranks.size() > 1 and (config.loss.uncertainty or config.encoder.vfe == "pillar"):
             raise InputError("loss.uncertainty and encoder.vfe=pillar: one process only; start without torchrun")
         # the order of a run that goes on must not depend on which frames can be read: the next one takes a place
-        order = EpochOrder(config.train.repeat * len(data.train), batch_size, config.train.seed)
+        order = EpochOrder(config.train.repeat * len(data.train), batch_size, config.train.seed, data.drives)
         if order.count < ranks.size():
             raise InputError(f"{order.count} frames for {ranks.size()} ranks; start fewer")
         good, names = check_frames(data.train, config.train.skip_corrupt, self.say)
@@ -169,7 +168,7 @@ class Run:
         if config.augment.objects or config.augment.whole_frames:
             objects = sampler_of(training_objects(data, good, self.say), place)
         return DataLoader(
-            TrainingFrames(data.train, config, objects, place),
+            TrainingFrames(data.train, config, objects, place, data.drives),
             batch_sampler=order,
             collate_fn=collate,
             generator=torch.Generator(),  # otherwise every new epoch would draw from torch's global generator
@@ -421,7 +420,7 @@ class Run:
         if changed:
             raise InputError(f"{path}: was trained with another {changed[0]}; give its config, or another --out")
         if content.get("frames") != self.frames_id:
-            raise InputError(f"{path}: was trained on other frames; give its --data, or another --out")
+            raise InputError(f"{path}: was trained on other frames or drives; give its --data, or another --out")
 
     def restore(self) -> Progress:
         """Resumes the run from its checkpoint. Raises InputError if it is not whole."""

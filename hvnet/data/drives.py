@@ -1,0 +1,48 @@
+"""Drives: frames that follow each other in time show one street, and count as less than as many streets."""
+
+import csv
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from hvnet.exceptions import InputError
+
+
+def read_drives(path: Path, names: Sequence[str]) -> list[str]:
+    """The drive of each of the named frames, from a CSV file with the columns `frame` and `drive`; others are ignored.
+
+    Raises InputError if the file has not these columns, or not each frame once.
+    """
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = csv.DictReader(file, restval="")
+            missing = {"frame", "drive"} - set(rows.fieldnames or ())
+            if missing:
+                raise InputError(f"{path}:1: has no column {min(missing)}; the first line is to be frame,drive")
+            drives: dict[str, str] = {}
+            for row in rows:
+                if row["frame"] in drives:
+                    raise InputError(f"{path}:{rows.line_num}: frame {row['frame']} is listed twice; remove a line")
+                drives[row["frame"]] = row["drive"]
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file; it holds the drive of each frame, in columns frame,drive") from error
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read ({error}); give a CSV file with the columns frame,drive") from error
+    unknown = [name for name in names if not drives.get(name)]
+    if unknown:
+        raise InputError(
+            f"{path}: has no drive for {len(unknown)} of {len(names)} frames, such as {unknown[0]}; add a line for each"
+        )
+    return [drives[name] for name in names]
+
+
+def drive_weights(drives: Sequence[str]) -> Tensor:
+    """How often each frame (N,) is drawn compared to others: 1 / sqrt(frames of its drive), float64.
+
+    A drive of n frames is thus worth sqrt(n) drives of one frame: more than one, as its scans differ, and less than n.
+    """
+    frames_of = Counter(drives)
+    return torch.tensor([frames_of[drive] for drive in drives], dtype=torch.float64).rsqrt()
