@@ -105,6 +105,7 @@ class AugmentConfig:
     translation: tuple[float, float, float] = (0.2, 0.2, 0.2)  # standard deviations in metres
     objects: dict[str, int] = field(default_factory=dict)  # objects of a class after ground-truth sampling
     whole_frames: float = 0.0  # probability that all objects of one frame of the database are inserted instead
+    fade_out: int = 0  # last epochs of a run in which no object is inserted
     mix: float = 0.0  # probability that a sector of the frame is taken from another frame
 
 
@@ -374,6 +375,7 @@ CHECKS = (
     Check("loss", "localization classification vertical direction iou", "0 or more", lambda v: v >= 0),
     Check("loss", "beta", "above 0", lambda v: v > 0),
     Check("augment", "flip whole_frames mix", "between 0 and 1", lambda v: 0 <= v <= 1),
+    Check("augment", "fade_out", "0 (none) or more", lambda v: v >= 0),
     Check("augment", "rotation", "0 or more", lambda v: v >= 0),
     Check("augment", "scaling", "0 < low <= high", lambda v: 0 < v[0] <= v[1]),
     Check("augment", "translation", "0 or more", lambda v: min(v) >= 0),

@@ -39,6 +39,22 @@ def test_an_item_depends_on_seed_epoch_and_number_alone(scenes: Path, tiny: Conf
     assert not same(first[0, 0], frames(seed=1)[0, 0])
 
 
+def test_no_object_is_inserted_in_the_last_epochs(scenes: Path, tiny: Config) -> None:
+    """Of three epochs two have more objects than the frames themselves, the same as without fading."""
+    objects = sampler_of(load_database(scenes, IDS, []), CPU)
+
+    def boxes(fade_out: int, **changes: object) -> list[int]:
+        augmentation = dataclasses.replace(tiny.augment, fade_out=fade_out, rotation=0.0, **changes)
+        config = dataclasses.replace(tiny, augment=augmentation, train=dataclasses.replace(tiny.train, epochs=3))
+        frames = TrainingFrames(KittiFrames(scenes, IDS), config, objects, CPU)
+        return [sum(len(frames.augmented(epoch, k).boxes) for k in range(3)) for epoch in range(3)]
+
+    for changes in ({}, {"objects": {}, "whole_frames": 1.0}):
+        some, none, plain = boxes(1, **changes), boxes(3, **changes), boxes(0, **changes)
+        assert some == [*plain[:2], none[2]]
+        assert all(fewer < more for fewer, more in zip(none, plain, strict=True))
+
+
 def test_order_of_an_epoch() -> None:
     order = EpochOrder(50, 4, seed=3)
     first = list(order)

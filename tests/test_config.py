@@ -124,6 +124,7 @@ def test_whole_numbers_are_numbers(tree: dict[str, Any]) -> None:
         ("augment.objects", {"Tram": 1}, "augment.objects.Tram", "want a class of head.classes"),
         ("augment.objects", {"Car": -1}, "augment.objects.Car", "want 0 or more"),
         ("augment.flip", 1.5, "augment.flip", "want between 0 and 1"),
+        ("augment.fade_out", -1, "augment.fade_out", r"want 0 \(none\) or more"),
         ("augment.rotation", -1, "augment.rotation", "want 0 or more"),
         ("augment.scaling", [1.1, 0.9], "augment.scaling", "want 0 < low <= high"),
         ("augment.translation", [0, 0, -1], "augment.translation", "want 0 or more"),

@@ -296,6 +296,13 @@ def test_another_config_is_refused(scenes: Path, begun: Path, change: str, key: 
     assert contents(begun) == before
 
 
+@pytest.mark.parametrize("change", ["train.cosine=true", "augment.fade_out=1"])
+def test_other_epochs_are_refused_where_they_matter(scenes: Path, tmp_path: Path, change: str) -> None:
+    run(scenes, tmp_path / "out", change, "train.epochs=1")
+    with pytest.raises(InputError, match=r"was trained with another train\.epochs"):
+        run(scenes, tmp_path / "out", change, resume=True)
+
+
 def test_a_broken_checkpoint_is_refused(scenes: Path, begun: Path) -> None:
     path = begun / "checkpoint.pt"
     content = load_checkpoint(path)

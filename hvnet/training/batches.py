@@ -145,7 +145,10 @@ class TrainingFrames(Dataset[Sample | InputError]):
             others = (other.points, other.boxes, other.labels)
             points, boxes, labels = mix_sectors(points, boxes, labels, others, generator)
             note = "\n".join(filter(None, (note, other.note)))
-        points, boxes, labels = augment(points, boxes, labels, self.objects, options, generator, self.classes)
+        # inserted objects are too many, and stand where none would be: the last epochs see streets as they are
+        faded = epoch >= self.config.train.epochs - options.fade_out
+        objects = None if faded else self.objects
+        points, boxes, labels = augment(points, boxes, labels, objects, options, generator, self.classes)
         low, high = boxes.new_tensor(self.config.encoder.point_range).view(2, 3)
         inside = ((boxes[:, :2] >= low[:2]) & (boxes[:, :2] < high[:2])).all(dim=1) & (labels >= 0)
         return Sample(points, boxes[inside], labels[inside], note, frame.name)

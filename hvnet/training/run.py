@@ -63,7 +63,7 @@ CHANGEABLE = [
         "skip_non_finite",
     )
 ]
-"""Keys that may differ from the run being resumed; epochs only if the learning rate does not depend on them."""
+"""Keys that may differ from the run being resumed; epochs only if neither the rate nor the data depend on them."""
 
 
 class Progress(NamedTuple):
@@ -415,7 +415,7 @@ class Run:
         there = config_to_dict(config_from_dict(content["config"], str(path)))  # adds newer keys
         here = config_to_dict(self.config)
         changed = sorted({key for key, _ in set(_leaves(there)) ^ set(_leaves(here))})
-        fixed = {"train.epochs"} if self.config.train.cosine else set()
+        fixed = {"train.epochs"} if self.config.train.cosine or self.config.augment.fade_out else set()
         changed = [key for key in changed if key not in CHANGEABLE or key in fixed]
         if changed:
             raise InputError(f"{path}: was trained with another {changed[0]}; give its config, or another --out")
