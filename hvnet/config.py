@@ -143,6 +143,7 @@ class TrainConfig:
     repeat: int = 1  # passes over the frames in an epoch, augmented differently each time
     drives: str = ""  # CSV file in the data's folder with the columns frame and drive: long drives are weighed down
     gradient_clip: float = 10.0  # largest norm of the gradient
+    average: float = 0.0  # decay a step of the moving average of the weights, which is then validated; 0: no average
     validate_every: int = 10  # epochs; the last epoch is always validated
     report_every: int = 1  # steps; between reports a GPU is not waited for
     pictures: int = 4  # validation frames drawn
@@ -384,6 +385,7 @@ CHECKS = (
     Check("train", "epochs repeat batch_size validate_every report_every", "1 or more", lambda v: v > 0),
     Check("train", "warmup_steps pictures workers weight_decay seed", "0 or more", lambda v: v >= 0),
     Check("train", "learning_rate warmup_ratio decay_ratio gradient_clip", "above 0", lambda v: v > 0),
+    Check("train", "average", "at least 0 and below 1", lambda v: 0 <= v < 1),
     Check("train", "seed", "below 2**63", lambda v: v < 2**63),
     Check("train", "decay_epochs", "epochs above 0", lambda v: min(v, default=1) > 0),
     Check("synthetic", "train_frames val_frames", "1 or more", lambda v: v > 0),

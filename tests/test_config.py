@@ -175,6 +175,7 @@ def test_whole_numbers_are_numbers(tree: dict[str, Any]) -> None:
         ("train.warmup_steps", -1, "train.warmup_steps", "want 0 or more"),
         ("train.workers", -1, "train.workers", "want 0 or more"),
         ("train.weight_decay", -1, "train.weight_decay", "want 0 or more"),
+        ("train.average", 1, "train.average", "want at least 0 and below 1"),
         ("train.seed", -1, "train.seed", "want 0 or more"),
         ("train.seed", 2**63, "train.seed", "want below"),
         ("train.learning_rate", 0, "train.learning_rate", "want above 0"),

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -62,6 +63,16 @@ def test_folders_to_begin_and_to_go_on(tmp_path: Path) -> None:
 
 
 def test_room(demo: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hvnet.training.folder.ROOM", 0)
+    size = sum(weight.numel() * 4 for weight in HVNet(demo).parameters())
+    averaging = HVNet(replace(demo, train=replace(demo.train, average=0.5)))
+    for model, enough in ((HVNet(demo), 6 * size), (averaging, 8 * size)):
+        monkeypatch.setattr(shutil, "disk_usage", lambda _, free=enough: SimpleNamespace(free=free))
+        check_room(tmp_path, model)
+        monkeypatch.setattr(shutil, "disk_usage", lambda _, free=enough - 1: SimpleNamespace(free=free))
+        with pytest.raises(InputError, match="the run needs"):
+            check_room(tmp_path, model)
+    monkeypatch.undo()
     check_room(tmp_path / "a" / "b", HVNet(demo))
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=10**6))
     with pytest.raises(InputError, match=r"1 MB free, the run needs \d+ MB; free some, or give another --out"):

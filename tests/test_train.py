@@ -30,11 +30,12 @@ from hvnet.data.kitti import KittiFrames, read_split
 from hvnet.exceptions import InputError, Stopped
 from hvnet.kernels import launch
 from hvnet.network.checkpoint import load_checkpoint, save_checkpoint
-from hvnet.network.detector import load
+from hvnet.network.detector import Detector, load
+from hvnet.network.model import HVNet
 from hvnet.train import choose_out, main
 from hvnet.training import run as run_module
 from hvnet.training.batches import collate, kitti_data
-from hvnet.training.run import Run, learning_rate
+from hvnet.training.run import Progress, Run, learning_rate
 from tests.helpers import ROOT, contents, same
 from tests.models import SHORT
 
@@ -219,6 +220,62 @@ def test_drives(copied: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "none").exists()
 
 
+def test_averaged_weights(
+    scenes: Path, trained: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are validated and used; the run itself is that without them, and goes on to the same bits."""
+    changes = ["train.average=0.3", "train.report_every=2"]
+    validated, detector = [], run_module.Detector
+
+    def noted(model: HVNet, device: torch.device) -> Detector:
+        validated.append(copy.deepcopy(model.state_dict()))
+        return detector(model, device)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(run_module, "Detector", noted)
+        run(scenes, tmp_path / "whole", *changes)
+    whole, plain = (load_checkpoint(folder / "checkpoint.pt") for folder in (tmp_path / "whole", trained[0]))
+    assert same(whole["raw"], plain["model"])
+    assert same(whole["optimizer"], plain["optimizer"])
+    mine, theirs = metrics(tmp_path / "whole"), metrics(trained[0])
+    assert [record["loss"] for record in mine] == [record["loss"] for record in theirs]
+    moving = {name for name, value in whole["raw"].items() if value.is_floating_point()}
+    still = {name for name in moving if same(whole["model"][name], whole["raw"][name])}
+    assert {name.rsplit(".", 2)[0] for name in still} == {"backbone.pyramid.upsilon.2"}  # a level that no class uses
+    assert same(validated[-1], whole["model"])
+    used = load(tmp_path / "whole" / "checkpoint.pt", "cpu").encoder.state_dict()
+    assert same(used, {name: whole["model"][f"encoder.{name}"] for name in used})
+
+    run(scenes, tmp_path / "out", *changes, "train.epochs=1")
+    run(scenes, tmp_path / "out", *changes, resume=True)
+    assert same(load_checkpoint(tmp_path / "out" / "checkpoint.pt"), whole)
+    assert metrics(tmp_path / "out") == mine
+    save_checkpoint(tmp_path / "out" / "checkpoint.pt", {key: value for key, value in whole.items() if key != "raw"})
+    with pytest.raises(InputError, match=r"does not hold a whole run \('raw'\)"):
+        run(scenes, tmp_path / "out", *changes, resume=True)
+
+
+def test_an_average_begins_at_once(scenes: Path, tiny: Config, tmp_path: Path, threads: None) -> None:
+    """At step t the decay is (1 + t) / (10 + t) until that is more than what is wanted, for the statistics as well."""
+    config = replace(tiny, train=replace(tiny.train, repeat=3, average=0.3))
+    training = Run(config, kitti_data(scenes, config), tmp_path / "run")
+    assert training.averaged is not None
+    training.model.train()
+    names = ("heads.0.score.bias", "backbone.main_stream.blocks.0.first.1.running_var")
+    averages = [training.model.state_dict()[name].double() for name in names]
+    decays = (1 / 10, 2 / 11, 3 / 12, 0.3, 0.3, 0.3)
+    for step, (batch, decay) in enumerate(zip(training.loader, decays, strict=True)):
+        training.progress = Progress(step=step)
+        training.step(batch)
+        now = [training.model.state_dict()[name].double() for name in names]
+        averages = [decay * average + (1 - decay) * value for average, value in zip(averages, now, strict=True)]
+        assert not same(averages, now)
+        for name, average in zip(names, averages, strict=True):
+            torch.testing.assert_close(
+                training.averaged.state_dict()[name], average, rtol=1e-5, atol=1e-7, check_dtype=False
+            )
+
+
 def test_frames_that_changed_since_are_said(copied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Once, and the run goes on with them as they are; a file that was only touched is no change."""
     out, training = tmp_path / "out", copied / "training"
@@ -387,14 +444,15 @@ def test_two_ranks_train_and_one_goes_on(scenes: Path, trained: tuple[Path, str]
     """torchrun: the losses are those of one process but for rounding, and all frames are validated."""
     out = tmp_path / "out"
     arguments = ["--config", str(DEMO), "--out", str(out), "--device", "cpu", "--data", str(scenes)]
-    arguments += [part for change in (*SHORT, "train.epochs=1") for part in ("--set", change)]
+    average = "train.average=0.9"  # changes no loss, and both ranks validate with it
+    arguments += [part for change in (*SHORT, average, "train.epochs=1") for part in ("--set", change)]
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     done = subprocess.run(
         [*command, "-m", "hvnet.train", *arguments], cwd=DEMO.parents[1], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("epoch   1 ") == 1
-    run(scenes, out, resume=True)
+    run(scenes, out, average, resume=True)
     for mine, whole in zip(metrics(out), metrics(trained[0]), strict=True):
         assert mine["step"] == whole["step"]
         assert mine["loss"] == pytest.approx(whole["loss"], rel=0.02)

@@ -64,7 +64,7 @@ def test_what_waits_is_counted() -> None:
     assert waits(lambda: torch.where(values > 1, values, 0).cumsum(0)) == []
 
 
-@pytest.mark.parametrize("changed", ["nothing", "loss.box", "skip_non_finite"])
+@pytest.mark.parametrize("changed", ["nothing", "loss.box", "skip_non_finite", "average"])
 def test_a_step_waits_for_the_encoder_alone(scenes: Path, tiny: Config, tmp_path: Path, changed: str) -> None:
     """... and reading the losses is one wait, for however many steps."""
     config = tiny
@@ -73,6 +73,8 @@ def test_a_step_waits_for_the_encoder_alone(scenes: Path, tiny: Config, tmp_path
         config = dataclasses.replace(tiny, head=head, loss=loss)
     if changed == "skip_non_finite":
         config = dataclasses.replace(tiny, train=dataclasses.replace(tiny.train, skip_non_finite=True))
+    if changed == "average":
+        config = dataclasses.replace(tiny, train=dataclasses.replace(tiny.train, average=0.999))
     run = Run(config, kitti_data(scenes, config), tmp_path / "run", "cpu")
     run.model.train()
     batches = [batch.to(torch.device("cpu")) for batch in run.loader]

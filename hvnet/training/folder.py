@@ -61,10 +61,14 @@ def check_folder(out: Path, resume: bool) -> None:
 
 
 def check_room(out: Path, model: HVNet) -> None:
-    """Raises InputError if the disk has no room for a run: two checkpoints with weights and both moments of Adam."""
+    """Raises InputError if the disk has no room for a run: two checkpoints.
+
+    Each holds the weights, both moments of Adam and, if there is one, the average of the weights.
+    """
     folder = next(path for path in (out, *out.absolute().parents) if path.exists())
     free = shutil.disk_usage(folder).free
-    wanted = 2 * 3 * sum(weight.numel() * weight.element_size() for weight in model.parameters()) + ROOM
+    copies = 4 if model.config.train.average else 3
+    wanted = 2 * copies * sum(weight.numel() * weight.element_size() for weight in model.parameters()) + ROOM
     if free < wanted:
         raise InputError(
             f"{folder}: {free / 1e6:.0f} MB free, the run needs {wanted / 1e6:.0f} MB; free some, or give another --out"

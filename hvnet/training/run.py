@@ -5,6 +5,7 @@ one model together: each takes its share of every batch, and rank 0 prints and w
 """
 
 import contextlib
+import copy
 import hashlib
 import json
 import math
@@ -18,7 +19,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 from torch.utils.data import DataLoader
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -115,6 +117,7 @@ class Run:
                 self.check_checkpoint()
             self.loader = self.make_loader()
             self.model = HVNet(config).to(device)
+            self.averaged = copy.deepcopy(self.model).requires_grad_(False) if config.train.average else None
             self.joint = ranks.wrap_ddp(self.model)  # the model, with its gradients averaged over the ranks
             self.optimizer = torch.optim.Adam(
                 self.model.parameters(),
@@ -199,7 +202,7 @@ class Run:
     def step(self, batch: Batch) -> None:
         """One step of the optimizer. Its losses are kept for `read_steps`: a GPU is not waited for.
 
-        A loss or gradient that is not finite changes nothing.
+        A loss or gradient that is not finite changes nothing in the model.
         """
         config, model, progress = self.config.train, self.model, self.progress
         for group in self.optimizer.param_groups:
@@ -224,6 +227,9 @@ class Run:
             for name, statistic in statistics.items():  # the batch norms have seen what is not finite
                 buffer = model.get_buffer(name)
                 buffer.copy_(torch.where(finite, buffer, statistic))
+        if self.averaged is not None:  # at first over few steps, so that the weights of the start are soon forgotten
+            decay = min(config.average, (1 + progress.step) / (10 + progress.step))
+            update_average(self.averaged, model, decay)
         self.unread.append(Step(progress.step, batch.names, tuple(terms), numbers))
 
     def read_steps(self) -> list[dict[str, float]]:
@@ -319,7 +325,7 @@ class Run:
 
     def validate(self) -> dict[str, dict[str, Any]]:
         """Detects in the validation frames, scores the boxes by KITTI's protocol and draws the first few frames."""
-        detector = Detector(self.model, self.device)
+        detector = Detector(self.averaged or self.model, self.device)
         classes, point_range = detector.classes, self.config.encoder.point_range
 
         def draw(detected: Detected) -> None:
@@ -395,11 +401,14 @@ class Run:
         print_once([f"{what}: left out; its frames are in {path}"] if ranks.rank() == 0 else [], set())
 
     def save(self) -> None:
-        """Writes a checkpoint: all that is needed to resume the run."""
+        """Writes a checkpoint: all that is needed to resume the run.
+
+        `model` is what is validated and used: the averaged weights, if there are any; those trained are then `raw`.
+        """
         if ranks.rank() == 0:
             content = {
                 "config": config_to_dict(self.config),
-                "model": self.model.state_dict(),
+                "model": (self.averaged or self.model).state_dict(),
                 "optimizer": self.optimizer.state_dict(),
                 "frames": self.frames_id,
                 "stamps": {split: torch.from_numpy(stamps.numbers) for split, stamps in self.stamps.items()},
@@ -407,6 +416,8 @@ class Run:
                 "random": torch.get_rng_state(),
                 **self.progress._asdict(),
             }
+            if self.averaged is not None:
+                content["raw"] = self.model.state_dict()
             save_checkpoint(self.checkpoint, content)
 
     def check_checkpoint(self) -> None:
@@ -426,7 +437,9 @@ class Run:
         """Resumes the run from its checkpoint. Raises InputError if it is not whole."""
         path, content = self.checkpoint, load_checkpoint(self.checkpoint)
         try:
-            self.model.load_state_dict(content["model"])
+            self.model.load_state_dict(content["model" if self.averaged is None else "raw"])
+            if self.averaged is not None:
+                self.averaged.load_state_dict(content["model"])
             for group in content["optimizer"]["param_groups"]:  # a run may go on on another device
                 group["fused"] = self.optimizer.defaults["fused"]
             self.optimizer.load_state_dict(content["optimizer"])
@@ -451,6 +464,13 @@ def learning_rate(config: TrainConfig, step: int, epoch: int, steps: int) -> flo
     if step < config.warmup_steps:
         return decayed * (config.warmup_ratio + (1 - config.warmup_ratio) * step / config.warmup_steps)
     return decayed
+
+
+def update_average(averaged: nn.Module, model: nn.Module, decay: float) -> None:
+    """Sets weights and running statistics to decay * averaged + (1 - decay) * those of the model, in place."""
+    pairs = zip(averaged.state_dict().values(), model.state_dict().values(), strict=True)
+    means, values = zip(*(pair for pair in pairs if pair[0].is_floating_point()), strict=True)
+    get_ema_multi_avg_fn(decay)(means, values, None)
 
 
 @contextlib.contextmanager
