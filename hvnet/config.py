@@ -105,6 +105,7 @@ class AugmentConfig:
     translation: tuple[float, float, float] = (0.2, 0.2, 0.2)  # standard deviations in metres
     objects: dict[str, int] = field(default_factory=dict)  # objects of a class after ground-truth sampling
     whole_frames: float = 0.0  # probability that all objects of one frame of the database are inserted instead
+    on_ground: bool = False  # inserted objects are raised or lowered to stand on the frame's ground
     fade_out: int = 0  # last epochs of a run in which no object is inserted
     mix: float = 0.0  # probability that a sector of the frame is taken from another frame
 

@@ -9,8 +9,8 @@ import torch
 from torch.utils.data import DataLoader
 
 from hvnet.config import Config, DataConfig
-from hvnet.data.augment import sampler_of
 from hvnet.data.gt_database import load_database
+from hvnet.data.insert import sampler_of
 from hvnet.data.kitti import KittiFrames
 from hvnet.data.sources import JoinedFrames
 from hvnet.exceptions import InputError

@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
 from hvnet.config import Config
-from hvnet.data.augment import sampler_of
 from hvnet.data.gt_database import load_database
+from hvnet.data.insert import sampler_of
 from hvnet.data.kitti import KittiFrames
 from hvnet.kernels import launch
 from hvnet.training.batches import Batch, TrainingFrames, collate, kitti_data

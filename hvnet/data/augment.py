@@ -1,73 +1,33 @@
-"""3D data augmentation (the paper's section 4.1): ground-truth sampling, then flip, rotation, scaling, translation.
+"""3D data augmentation (the paper's section 4.1): objects of other frames, then flip, rotation, scaling, translation.
 
 Points (N, 4) and boxes (M, 7) are in LiDAR axes. Nothing is changed in place, and every random number comes from the
 generator that is passed in: one that is seeded by (seed, epoch, index) makes a sample repeatable on its own.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
-import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from hvnet.boxes import boxes_collide, limit_angle, points_in_boxes
+from hvnet.boxes import limit_angle, points_in_boxes
 from hvnet.config import AugmentConfig
-from hvnet.data.gt_database import Database, object_points
-from hvnet.kernels.launch import many_threads
-
-MIN_POINTS = 5
-"""Objects of fewer points are not inserted, as in SECOND."""
-
-
-class ObjectSampler(NamedTuple):
-    """A ground-truth database that is ready to draw from."""
-
-    database: Database
-    points: Tensor  # (M, 4) of all objects, on the device of the frames
-    of_class: dict[str, np.ndarray]  # rows of each class that `sample_objects` draws from
-    of_frame: list[np.ndarray]  # rows of each frame that `sample_frame` inserts
-
-
-def sampler_of(database: Database, device: torch.device) -> ObjectSampler:
-    """The database with its points on a device, and its rows by class and by frame."""
-    has_points = np.diff(database.offsets) >= MIN_POINTS
-    # rated by KITTI: easy, moderate or hard; SECOND leaves out the others. Without a camera there are no heights
-    high = (database.bbox_height > 25) | (not database.bbox_height.any())
-    rated = high & (database.occlusion <= 2) & (database.truncation <= 0.5)
-    of_class = {str(n): np.flatnonzero(rated & has_points & (database.name == n)) for n in np.unique(database.name)}
-    by_frame = np.argsort(database.frame, kind="stable")
-    _, starts = np.unique(database.frame[by_frame], return_index=True)
-    of_frame = [rows[has_points[rows]] for rows in np.split(by_frame, starts[1:])]
-    return ObjectSampler(database, object_points(database).to(device), of_class, of_frame)
-
-
-def send(tensor: Tensor, device: torch.device) -> Tensor:
-    """A tensor of the host on a device. For a GPU it is copied from pinned memory, so that the host does not wait."""
-    return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor.to(device)
-
-
-def drop(points: Tensor, gone: Tensor) -> Tensor:
-    """The points (N, 4) without those of a mask (N,).
-
-    Many threads, which read no number from the device, leave rows of NaN for them: such points are in no voxel.
-    """
-    if many_threads(points.device):
-        return points.masked_fill(gone[:, None], math.nan)
-    return points[~gone]
+from hvnet.data.insert import ObjectSampler, drop, sample_frame, sample_objects, send
 
 
 def augment(
     points: Tensor,
     boxes: Tensor,
     labels: Tensor,
+    ground: Tensor,
     objects: ObjectSampler | None,
     options: AugmentConfig,
     generator: Generator,
     classes: Sequence[str],
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Augments one frame: points (N, 4), boxes (M, 7) and labels (M,), which number the boxes' classes in `classes`.
+
+    ground: (G, 3) of `ground_points`, for inserted objects to stand on.
 
     The points may be on a GPU, from which nothing is read; boxes and labels stay on the host, because the random
     choices depend on them.
@@ -76,10 +36,13 @@ def augment(
     keep the pose in which the scanner saw them, which is in the camera's view only before the frame is turned.
     """
     if objects is not None:
+        stand = ground if options.on_ground else None
         if options.whole_frames and torch.rand((), generator=generator).item() < options.whole_frames:
-            points, boxes, labels = sample_frame(points, boxes, labels, objects, generator, classes)
+            points, boxes, labels = sample_frame(points, boxes, labels, objects, generator, classes, stand)
         else:
-            points, boxes, labels = sample_objects(points, boxes, labels, objects, options.objects, generator, classes)
+            points, boxes, labels = sample_objects(
+                points, boxes, labels, objects, options.objects, generator, classes, stand
+            )
     points, boxes = random_flip(points, boxes, options.flip, generator)
     points, boxes = random_rotation(points, boxes, options.rotation, generator)
     points, boxes = random_scaling(points, boxes, options.scaling, generator)
@@ -134,10 +97,15 @@ def random_translation(
 
 
 def mix_sectors(
-    points: Tensor, boxes: Tensor, labels: Tensor, others: tuple[Tensor, Tensor, Tensor], generator: Generator
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Takes everything on one side of a direction from another frame (points, boxes, labels), as PolarMix (Xiao et al.,
-    2022) swaps sectors of scans.
+    points: Tensor,
+    boxes: Tensor,
+    labels: Tensor,
+    ground: Tensor,
+    others: tuple[Tensor, Tensor, Tensor, Tensor],
+    generator: Generator,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Takes everything on one side of a direction from another frame (points, boxes, labels, ground), as PolarMix (Xiao
+    et al., 2022) swaps sectors of scans.
 
     The direction is uniform within 30 degrees of straight ahead. A box belongs to the side of its centre and keeps its
     points beyond the border, where they replace the points of the frame on that side.
@@ -163,73 +131,8 @@ def mix_sectors(
     stays &= ~within(points, boxes[~kept_boxes]) | in_own
     comes &= ~within(others[0], others[1][~other_boxes]) | from_new
     cloud = torch.cat((drop(points, ~stays), drop(others[0], ~comes)))
-    return cloud, torch.cat((own, new)), torch.cat((own_labels, new_labels))
-
-
-def sample_objects(
-    points: Tensor,
-    boxes: Tensor,
-    labels: Tensor,
-    objects: ObjectSampler,
-    counts: Mapping[str, int],
-    generator: Generator,
-    classes: Sequence[str],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Ground-truth sampling of SECOND: inserts objects of other frames at their original positions.
-
-    labels (M,) int64 number the boxes' classes in `classes`; boxes of any other number only block their place. For each
-    class in `counts`, objects are drawn without replacement until the frame has that many of them.
-    """
-    drawn: list[np.ndarray] = [np.empty(0, np.int64)]
-    drawn_labels: list[int] = []
-    for name, count in counts.items():
-        label = classes.index(name)
-        missing = max(0, count - int((labels == label).sum()))
-        known = objects.of_class.get(name, drawn[0])
-        picked = torch.randperm(len(known), generator=generator)[:missing].numpy()
-        drawn.append(known[picked])
-        drawn_labels += [label] * len(picked)
-    return _insert(points, boxes, labels, objects, np.concatenate(drawn), drawn_labels)
-
-
-def sample_frame(
-    points: Tensor, boxes: Tensor, labels: Tensor, objects: ObjectSampler, generator: Generator, classes: Sequence[str]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Inserts all objects of one frame of the database into points (N, 4), boxes (M, 7) and labels (M,).
-
-    They keep their arrangement: a queue at a light, cars along a kerb. Those of other classes have label -1.
-    """
-    drawn = objects.of_frame[int(torch.randint(len(objects.of_frame), (), generator=generator))]
-    drawn_labels = [classes.index(name) if name in classes else -1 for name in objects.database.name[drawn]]
-    return _insert(points, boxes, labels, objects, drawn, drawn_labels)
-
-
-def _insert(
-    points: Tensor,
-    boxes: Tensor,
-    labels: Tensor,
-    objects: ObjectSampler,
-    drawn: np.ndarray,
-    drawn_labels: Sequence[int],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Inserts rows of the database, in this order, into a frame.
-
-    An object that collides in bird's eye view with a box of the frame or with one inserted before is skipped, not
-    replaced. Points of the frame inside an inserted box give way to the object's own.
-    """
-    drawn_boxes = torch.from_numpy(objects.database.box[drawn])
-    collides = boxes_collide(drawn_boxes, torch.cat((boxes, drawn_boxes))).numpy()
-    standing = np.arange(len(boxes) + len(drawn)) < len(boxes)
-    for k in range(len(drawn)):
-        standing[len(boxes) + k] = not (collides[k] & standing).any()
-    inserted = np.flatnonzero(standing[len(boxes) :])
-    if len(inserted) == 0:
-        return points, boxes, labels
-    new_boxes = drawn_boxes[inserted]
-    points = drop(points, points_in_boxes(points, send(new_boxes, points.device)).any(dim=1))
-    offsets = objects.database.offsets
-    points = torch.cat([points, *(objects.points[offsets[k] : offsets[k + 1]] for k in drawn[inserted])])
-    return points, torch.cat((boxes, new_boxes)), torch.cat((labels, labels.new_tensor(drawn_labels)[inserted]))
+    mixed = torch.cat((ground[left(ground) != left_from_other], others[3][left(others[3]) == left_from_other]))
+    return cloud, torch.cat((own, new)), torch.cat((own_labels, new_labels)), mixed
 
 
 def _uniform(low: float, high: float, generator: Generator) -> float:

@@ -27,8 +27,8 @@ from tqdm import tqdm
 
 from hvnet import ranks
 from hvnet.config import Config, TrainConfig, config_from_dict, config_to_dict
-from hvnet.data.augment import sampler_of
 from hvnet.data.frame import notes
+from hvnet.data.insert import sampler_of
 from hvnet.data.stamps import Change, Stamps, describe_changes, find_changes, take_stamps
 from hvnet.evaluation.scoring import Detected, background_note, print_once, score
 from hvnet.evaluation.tables import format_table
