@@ -2,12 +2,11 @@
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 
 from hvnet.boxes import bev_corners, boxes_collide, points_in_boxes
 from hvnet.config import AugmentConfig
@@ -20,64 +19,12 @@ from hvnet.data.augment import (
     random_translation,
 )
 from hvnet.data.ground import ground_points
-from hvnet.data.gt_database import Database, read_database
-from hvnet.data.insert import ObjectSampler, sample_frame, sample_objects, sampler_of
+from hvnet.data.gt_database import read_database
+from hvnet.data.insert import sample_objects, sampler_of
 from hvnet.data.kitti import read_frame
+from tests.objects import CLASSES, COUNTS, car, make_objects, no_boxes, points_of, scene, seeded
 
-CLASSES = ("Car", "Pedestrian", "Cyclist")
-COUNTS = {"Car": 15, "Pedestrian": 8, "Cyclist": 8}
 NO_GROUND = torch.zeros(0, 3)
-
-
-def seeded(seed: int = 0) -> Generator:
-    return Generator().manual_seed(seed)
-
-
-def scene(seed: int = 0) -> tuple[Tensor, Tensor]:
-    """2000 points (N, 4) and 12 boxes (M, 7), with points inside every box."""
-    generator = seeded(seed)
-    boxes = torch.rand(12, 7, generator=generator)
-    boxes = (boxes - 0.5) * torch.tensor([60.0, 60, 2, 0, 0, 0, 2 * math.pi]) + torch.tensor([30.0, 0, 0, 4, 2, 2, 0])
-    points = torch.rand(2000, 4, generator=generator)
-    points[:, :3] = (points[:, :3] - 0.5) * 3
-    points[:, :3] += boxes[torch.arange(2000) % 12, :3]
-    return points, boxes
-
-
-def make_objects(objects: list[tuple[str, list[float]]], points_each: int = 10, **columns: list) -> ObjectSampler:
-    """A database of objects (class, box) with `points_each` points along their middles."""
-    count = len(objects)
-    box = np.array([box for _, box in objects], dtype=np.float32).reshape(-1, 7)
-    xyz_mm = np.zeros((3, count * points_each), dtype=np.int16)
-    xyz_mm[0] = np.tile(np.arange(points_each), count)
-    arrays = {"truncation": [0.0] * count, "occlusion": [0] * count, "bbox_height": [40.0] * count}
-    arrays |= {"frame": [0] * count} | columns
-    database = Database(
-        xyz_mm=xyz_mm,
-        reflectance=np.full(count * points_each, 50, dtype=np.uint8),
-        offsets=np.arange(count + 1) * points_each,
-        centre_mm=(box[:, :3] * 1000).round().astype(np.int32),
-        box=box,
-        name=np.array([name for name, _ in objects], dtype=np.str_),
-        frame=np.array(arrays["frame"], dtype=np.int32),
-        label_row=np.arange(count, dtype=np.int16),
-        truncation=np.array(arrays["truncation"], dtype=np.float32),
-        occlusion=np.array(arrays["occlusion"], dtype=np.int8),
-        bbox_height=np.array(arrays["bbox_height"], dtype=np.float32),
-    )
-    return sampler_of(database, torch.device("cpu"))
-
-
-def points_of(objects: ObjectSampler, k: int) -> Tensor:
-    return objects.points[objects.database.offsets[k] : objects.database.offsets[k + 1]]
-
-
-def car(x: float, y: float, yaw: float = 0.0) -> list[float]:
-    return [x, y, -1.0, 4.0, 2.0, 1.5, yaw]
-
-
-def no_boxes() -> tuple[Tensor, Tensor]:
-    return torch.zeros(0, 7), torch.zeros(0, dtype=torch.int64)
 
 
 def test_flip() -> None:
@@ -183,92 +130,6 @@ def test_augment_of_nothing() -> None:
     assert labels.shape == (0,)
 
 
-def test_sampling_tops_up_to_the_count() -> None:
-    database = make_objects([("Car", car(10.0 * k, 50)) for k in range(10)])
-    boxes = torch.tensor([car(0, 0), car(10, 0), car(20, 0)])
-    labels = torch.tensor([0, 0, -1])  # the third is no Car
-    points, boxes, labels = sample_objects(torch.zeros(0, 4), boxes, labels, database, {"Car": 5}, seeded(), CLASSES)
-    assert labels.tolist() == [0, 0, -1, 0, 0, 0]
-    assert len(boxes) == 6
-    assert len(boxes.unique(dim=0)) == 6  # drawn without replacement
-    assert len(points) == 30
-    full = sample_objects(points, boxes, labels, database, {"Car": 4}, seeded(), CLASSES)
-    assert torch.equal(full[1], boxes)
-
-
-def test_sampling_takes_what_there_is() -> None:
-    database = make_objects([("Car", car(10, 0))])
-    _, boxes, labels = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(), CLASSES)
-    assert boxes.tolist() == [car(10, 0)]
-    assert labels.tolist() == [0]
-
-
-def test_inserted_object_keeps_its_pose_and_points() -> None:
-    database = make_objects([("Pedestrian", [10, 5, -0.5, 0.8, 0.6, 1.8, 0.7])])
-    cloud = torch.tensor([[10.0, 5, -0.5, 0.1], [30, 5, -0.5, 0.1], [10, 5, 3, 0.1]])
-    points, boxes, labels = sample_objects(cloud, *no_boxes(), database, COUNTS, seeded(), CLASSES)
-    # the point of the frame inside the box gives way to the object's
-    assert torch.equal(points, torch.cat((cloud[1:], points_of(database, 0))))
-    assert torch.equal(boxes, torch.from_numpy(database.database.box))
-    assert labels.tolist() == [1]
-
-
-def test_sampled_object_that_collides_is_given_up() -> None:
-    database = make_objects([("Car", car(10, 0)), ("Car", car(30, 0))])
-    van = torch.tensor([car(12, 1, 0.5)])
-    cloud = torch.tensor([[10.0, 0, -1, 0.1]])
-    points, boxes, labels = sample_objects(cloud, van, torch.tensor([-1]), database, COUNTS, seeded(), CLASSES)
-    assert boxes.tolist() == [van[0].tolist(), car(30, 0)]
-    assert labels.tolist() == [-1, 0]
-    assert torch.equal(points, torch.cat((cloud, points_of(database, 1))))
-
-
-def test_of_two_sampled_objects_that_collide_one_is_inserted() -> None:
-    database = make_objects([("Car", car(10, 0)), ("Cyclist", car(11, 0)), ("Car", car(10, 1))])
-    for seed in range(10):
-        _, boxes, labels = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(seed), CLASSES)
-        assert labels.tolist() == [0]
-        assert boxes.shape == (1, 7)
-
-
-def test_objects_that_are_hardly_seen_are_not_inserted() -> None:
-    objects = [("Car", car(10.0 * k, 0)) for k in range(4)]
-    columns: dict[str, Any] = {
-        "truncation": [0, 0.51, 0, 0.5],
-        "occlusion": [3, 0, 0, 2],
-        "bbox_height": [40, 40, 25, 25.5],
-    }
-    database = make_objects(objects, **columns)
-    _, boxes, _ = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(), CLASSES)
-    assert boxes.tolist() == [car(30, 0)]
-    database = make_objects(objects, **columns | {"bbox_height": [0] * 4})  # without a camera
-    _, boxes, _ = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(), CLASSES)
-    assert boxes[:, 0].sort().values.tolist() == [20, 30]
-    for points_each, inserted in ((4, 0), (5, 4)):
-        database = make_objects(objects, points_each)
-        _, boxes, _ = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(), CLASSES)
-        assert len(boxes) == inserted
-
-
-def test_no_objects_asked_for() -> None:
-    points, boxes = scene()
-    labels = torch.zeros(len(boxes), dtype=torch.int64)
-    database = make_objects([("Car", car(100, 0))])
-    sampled = sample_objects(points, boxes, labels, database, {}, seeded(), CLASSES)
-    assert all(a is b for a, b in zip(sampled, (points, boxes, labels), strict=True))
-
-
-def test_a_whole_frame_keeps_together() -> None:
-    objects = [("Car", car(10.0 * k, 0)) for k in range(4)] + [("Van", car(50, 0)), ("Pedestrian", car(60, 0))]
-    database = make_objects(objects, frame=[3, 7, 7, 3, 7, 7])
-    found = set()
-    for seed in range(10):
-        points, boxes, labels = sample_frame(torch.zeros(0, 4), *no_boxes(), database, seeded(seed), CLASSES)
-        assert len(points) == 10 * len(boxes)
-        found.add((tuple(boxes[:, 0].tolist()), tuple(labels.tolist())))
-    assert found == {((0.0, 30.0), (0, 0)), ((10.0, 20.0, 50.0, 60.0), (0, 0, -1, 1))}
-
-
 def test_mixed_sectors_meet_at_a_border() -> None:
     """Two rings of points: each side is of one frame, no point is there twice, and every box has all its points."""
     angle = torch.linspace(-1.5, 1.5, 600)
@@ -278,7 +139,7 @@ def test_mixed_sectors_meet_at_a_border() -> None:
     boxes, labels = torch.tensor(around), torch.tensor([0, 1, -1])
     outcomes = set()
     for seed in range(20):
-        others = (other_ring, boxes.clone(), labels + 20, other_ring[:, :3] + 1)
+        others = (other_ring, boxes.clone(), labels + 20, other_ring[:, :3] + torch.tensor([0, 0, 1.0]))
         points, kept, of_kept, ground = mix_sectors(ring, boxes, labels, ring[:, :3], others, seeded(seed))
         own = of_kept < 10
         assert len(kept) == 3  # the two frames have boxes at the same three places
@@ -291,7 +152,7 @@ def test_mixed_sectors_meet_at_a_border() -> None:
         assert (points[order, 3].diff() != 0).sum() <= 3
         assert len(points[:, :3].unique(dim=0)) == len(points)
         assert len(ground) == 600  # of either frame on its side
-        assert (ground[ground[:, :2].norm(dim=1).argsort()][:, 2] >= 0).all()
+        assert 0 < ground[:, 2].sum() < 600
     assert len(outcomes) > 2
 
 

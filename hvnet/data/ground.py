@@ -38,11 +38,12 @@ def ground_under(ground: Tensor, places: Tensor) -> Tensor:
     A plane is fitted to the lower ones, which walls and roofs are not among; then what the points nearby leave of it is
     added, the lower ones with more weight.
     """
+    ground, places = ground.double(), places.double()
     rows = torch.cat((ground[:, :2], torch.ones_like(ground[:, :1])), dim=1)
     height = ground[:, 2]
     weight = ((height - height.median()).abs() < SPREAD).to(height.dtype) if len(height) else height
     if weight.sum() < 6:
-        return places.new_full((len(places),), torch.nan, dtype=torch.float64)
+        return places.new_full((len(places),), torch.nan)
     # level where the points lie on a line and say nothing across it
     level = torch.diag(height.new_tensor([1.0, 1.0, 1e-5]))
     for _ in range(6):
@@ -52,7 +53,6 @@ def ground_under(ground: Tensor, places: Tensor) -> Tensor:
         weight = 1 / (1 + (left / torch.where(left > 0, NOISE, 2 * NOISE)).pow(4))
     near = left.abs() < LARGEST
     left, ground = left[near], ground[near]
-    places = places.double()
     weight = torch.exp(-torch.cdist(places, ground[:, :2]).square() / (2 * REACH**2))
     weight = weight * torch.exp(-left.clamp(min=0) / NOISE)
     residual = (weight @ left) / (weight.sum(dim=1) + LOW)

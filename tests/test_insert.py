@@ -1,0 +1,126 @@
+"""Insertion follows SECOND's rules, and puts objects on the ground where they land."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from hvnet.boxes import points_in_boxes
+from hvnet.data.insert import sample_frame, sample_objects
+from tests.objects import CLASSES, COUNTS, car, make_objects, no_boxes, points_of, scene, seeded
+
+
+def test_sampling_tops_up_to_the_count() -> None:
+    database = make_objects([("Car", car(10.0 * k, 50)) for k in range(10)])
+    boxes = torch.tensor([car(0, 0), car(10, 0), car(20, 0)])
+    labels = torch.tensor([0, 0, -1])  # the third is no Car
+    points, boxes, labels = sample_objects(torch.zeros(0, 4), boxes, labels, database, {"Car": 5}, seeded(), CLASSES)
+    assert labels.tolist() == [0, 0, -1, 0, 0, 0]
+    assert len(boxes) == 6
+    assert len(boxes.unique(dim=0)) == 6  # drawn without replacement
+    assert len(points) == 30
+    full = sample_objects(points, boxes, labels, database, {"Car": 4}, seeded(), CLASSES)
+    assert torch.equal(full[1], boxes)
+
+
+def test_sampling_takes_what_there_is() -> None:
+    database = make_objects([("Car", car(10, 0))])
+    _, boxes, labels = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(), CLASSES)
+    assert boxes.tolist() == [car(10, 0)]
+    assert labels.tolist() == [0]
+
+
+def test_inserted_object_keeps_its_pose_and_points() -> None:
+    database = make_objects([("Pedestrian", [10, 5, -0.5, 0.8, 0.6, 1.8, 0.7])])
+    cloud = torch.tensor([[10.0, 5, -0.5, 0.1], [30, 5, -0.5, 0.1], [10, 5, 3, 0.1]])
+    points, boxes, labels = sample_objects(cloud, *no_boxes(), database, COUNTS, seeded(), CLASSES)
+    # the point of the frame inside the box gives way to the object's
+    assert torch.equal(points, torch.cat((cloud[1:], points_of(database, 0))))
+    assert torch.equal(boxes, torch.from_numpy(database.database.box))
+    assert labels.tolist() == [1]
+
+
+def test_sampled_object_that_collides_is_given_up() -> None:
+    database = make_objects([("Car", car(10, 0)), ("Car", car(30, 0))])
+    van = torch.tensor([car(12, 1, 0.5)])
+    cloud = torch.tensor([[10.0, 0, -1, 0.1]])
+    points, boxes, labels = sample_objects(cloud, van, torch.tensor([-1]), database, COUNTS, seeded(), CLASSES)
+    assert boxes.tolist() == [van[0].tolist(), car(30, 0)]
+    assert labels.tolist() == [-1, 0]
+    assert torch.equal(points, torch.cat((cloud, points_of(database, 1))))
+
+
+def test_of_two_sampled_objects_that_collide_one_is_inserted() -> None:
+    database = make_objects([("Car", car(10, 0)), ("Cyclist", car(11, 0)), ("Car", car(10, 1))])
+    for seed in range(10):
+        _, boxes, labels = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(seed), CLASSES)
+        assert labels.tolist() == [0]
+        assert boxes.shape == (1, 7)
+
+
+def test_objects_that_are_hardly_seen_are_not_inserted() -> None:
+    objects = [("Car", car(10.0 * k, 0)) for k in range(4)]
+    columns: dict[str, Any] = {
+        "truncation": [0, 0.51, 0, 0.5],
+        "occlusion": [3, 0, 0, 2],
+        "bbox_height": [40, 40, 25, 25.5],
+    }
+    database = make_objects(objects, **columns)
+    _, boxes, _ = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(), CLASSES)
+    assert boxes.tolist() == [car(30, 0)]
+    database = make_objects(objects, **columns | {"bbox_height": [0] * 4})  # without a camera
+    _, boxes, _ = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(), CLASSES)
+    assert boxes[:, 0].sort().values.tolist() == [20, 30]
+    for points_each, inserted in ((4, 0), (5, 4)):
+        database = make_objects(objects, points_each)
+        _, boxes, _ = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(), CLASSES)
+        assert len(boxes) == inserted
+
+
+def test_no_objects_asked_for() -> None:
+    points, boxes = scene()
+    labels = torch.zeros(len(boxes), dtype=torch.int64)
+    database = make_objects([("Car", car(100, 0))])
+    sampled = sample_objects(points, boxes, labels, database, {}, seeded(), CLASSES)
+    assert all(a is b for a, b in zip(sampled, (points, boxes, labels), strict=True))
+
+
+def test_a_whole_frame_keeps_together() -> None:
+    objects = [("Car", car(10.0 * k, 0)) for k in range(4)] + [("Van", car(50, 0)), ("Pedestrian", car(60, 0))]
+    database = make_objects(objects, frame=[3, 7, 7, 3, 7, 7])
+    found = set()
+    for seed in range(10):
+        points, boxes, labels = sample_frame(torch.zeros(0, 4), *no_boxes(), database, seeded(seed), CLASSES)
+        assert len(points) == 10 * len(boxes)
+        found.add((tuple(boxes[:, 0].tolist()), tuple(labels.tolist())))
+    assert found == {((0.0, 30.0), (0, 0)), ((10.0, 20.0, 50.0, 60.0), (0, 0, -1, 1))}
+
+
+def test_objects_stand_on_the_ground_where_they_land(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A road that rises by 5 cm a metre: box and points are raised alike, and by many threads as by one."""
+    database = make_objects([("Car", car(10, 0)), ("Pedestrian", [30, 5, -0.5, 0.8, 0.6, 1.8, 0.7])])
+    places = torch.cartesian_prod(torch.arange(0.5, 50, 1), torch.arange(-20.5, 20, 1))
+    ground = torch.cat((places, 0.05 * places[:, :1] - 1.7), dim=1)
+
+    def inserted(ground: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(), CLASSES, ground)
+
+    points, boxes, labels = inserted(ground)
+    assert labels.tolist() == [0, 1]
+    bottom = boxes[:, 2] - boxes[:, 5] / 2
+    torch.testing.assert_close(bottom, torch.tensor([-1.2, -0.2]), atol=0.01, rtol=0)
+    before = torch.from_numpy(database.database.box)
+    assert torch.equal(boxes[:, [0, 1, 3, 4, 5, 6]], before[:, [0, 1, 3, 4, 5, 6]])
+    rise = (boxes[:, 2] - before[:, 2]).repeat_interleave(10)
+    was = torch.cat((points_of(database, 0), points_of(database, 1)))
+    torch.testing.assert_close(points[:, 2] - was[:, 2], rise)
+    assert torch.equal(points[:, [0, 1, 3]], was[:, [0, 1, 3]])
+    assert points_in_boxes(points, boxes).any(dim=1).all()
+    same = sample_objects(torch.zeros(0, 4), *no_boxes(), database, COUNTS, seeded(), CLASSES)
+    for found, want in zip(inserted(ground[:3]), same, strict=True):  # no ground is known
+        assert torch.equal(found, want)
+    assert torch.equal(database.points, torch.cat((points_of(database, 0), points_of(database, 1))))  # is not changed
+    monkeypatch.setattr("hvnet.kernels.launch.force_many_threads", True)
+    for found, want in zip(inserted(ground), (points, boxes, labels), strict=True):
+        assert torch.equal(found, want)
