@@ -30,6 +30,7 @@ class EncoderConfig:
 
     point_range: tuple[float, float, float, float, float, float] = (0.0, -32.0, -3.0, 64.0, 32.0, 2.0)
     voxel_size: tuple[float, float] = (0.2, 0.2)  # v_L, v_W in metres
+    flat_ground: bool = False  # heights are those above the ground under a point, so that slopes are taken out
     feature_scales: tuple[float, ...] = (0.5, 1.0, 2.0)  # S_T
     projection_scales: tuple[float, ...] = (1.0, 2.0, 4.0)  # S_R, each twice the one before
     feature_channels: int = 64  # q
@@ -105,7 +106,6 @@ class AugmentConfig:
     translation: tuple[float, float, float] = (0.2, 0.2, 0.2)  # standard deviations in metres
     objects: dict[str, int] = field(default_factory=dict)  # objects of a class after ground-truth sampling
     whole_frames: float = 0.0  # probability that all objects of one frame of the database are inserted instead
-    on_ground: bool = False  # inserted objects are raised or lowered to stand on the frame's ground
     fade_out: int = 0  # last epochs of a run in which no object is inserted
     mix: float = 0.0  # probability that a sector of the frame is taken from another frame
 

@@ -19,15 +19,15 @@ def augment(
     points: Tensor,
     boxes: Tensor,
     labels: Tensor,
-    ground: Tensor,
     objects: ObjectSampler | None,
     options: AugmentConfig,
     generator: Generator,
     classes: Sequence[str],
+    ground: float | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Augments one frame: points (N, 4), boxes (M, 7) and labels (M,), which number the boxes' classes in `classes`.
 
-    ground: (G, 3) of `ground_points`, for inserted objects to stand on.
+    ground: height of a flat ground, on which inserted objects stand; None: they keep their own height.
 
     The points may be on a GPU, from which nothing is read; boxes and labels stay on the host, because the random
     choices depend on them.
@@ -36,12 +36,11 @@ def augment(
     keep the pose in which the scanner saw them, which is in the camera's view only before the frame is turned.
     """
     if objects is not None:
-        stand = ground if options.on_ground else None
         if options.whole_frames and torch.rand((), generator=generator).item() < options.whole_frames:
-            points, boxes, labels = sample_frame(points, boxes, labels, objects, generator, classes, stand)
+            points, boxes, labels = sample_frame(points, boxes, labels, objects, generator, classes, ground)
         else:
             points, boxes, labels = sample_objects(
-                points, boxes, labels, objects, options.objects, generator, classes, stand
+                points, boxes, labels, objects, options.objects, generator, classes, ground
             )
     points, boxes = random_flip(points, boxes, options.flip, generator)
     points, boxes = random_rotation(points, boxes, options.rotation, generator)
@@ -100,12 +99,11 @@ def mix_sectors(
     points: Tensor,
     boxes: Tensor,
     labels: Tensor,
-    ground: Tensor,
-    others: tuple[Tensor, Tensor, Tensor, Tensor],
+    others: tuple[Tensor, Tensor, Tensor],
     generator: Generator,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Takes everything on one side of a direction from another frame (points, boxes, labels, ground), as PolarMix (Xiao
-    et al., 2022) swaps sectors of scans.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Takes everything on one side of a direction from another frame (points, boxes, labels), as PolarMix (Xiao et al.,
+    2022) swaps sectors of scans.
 
     The direction is uniform within 30 degrees of straight ahead. A box belongs to the side of its centre and keeps its
     points beyond the border, where they replace the points of the frame on that side.
@@ -131,8 +129,7 @@ def mix_sectors(
     stays &= ~within(points, boxes[~kept_boxes]) | in_own
     comes &= ~within(others[0], others[1][~other_boxes]) | from_new
     cloud = torch.cat((drop(points, ~stays), drop(others[0], ~comes)))
-    mixed = torch.cat((ground[left(ground) != left_from_other], others[3][left(others[3]) == left_from_other]))
-    return cloud, torch.cat((own, new)), torch.cat((own_labels, new_labels)), mixed
+    return cloud, torch.cat((own, new)), torch.cat((own_labels, new_labels))
 
 
 def _uniform(low: float, high: float, generator: Generator) -> float:

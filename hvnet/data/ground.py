@@ -1,59 +1,123 @@
-"""The ground of a frame: where an object stands that is put there."""
+"""The ground under a cloud: above it, heights depend neither on slopes nor on where the sensor is mounted.
+
+All is done in operations of fixed size, so that many threads read nothing from their device.
+"""
+
+import math
+from collections.abc import Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 CELL = 2.0
-"""Metres along a cell in which one point is looked for that lies on the ground."""
-LOW = 0.05
-"""Quantile of a cell's heights that is taken for the ground: the lowest points may be reflections from below it."""
+"""Metres along a cell of the map."""
+LOWEST, LEVELS = -60.0, 2**17
+"""Heights that are looked at begin here, metres, and are counted in so many millimetres."""
+SKIPPED = 20
+"""One in so many points of a cell lies too low: it may be a reflection from below the ground."""
 FEWEST = 3
 """Points of a cell that tells anything."""
+FEWEST_CELLS = 6
+"""Cells at about one height without which no ground is found."""
 SPREAD = 0.7
-"""Metres around the median of the low points within which the first guess takes them for ground."""
+"""Metres around the median of the cells within which the first guess takes them for ground."""
 NOISE = 0.15
-"""Metres by which ground points leave a plane; walls and cars rise further."""
+"""Metres by which the ground leaves a plane; walls and cars rise further."""
 LARGEST = 0.6
-"""Metres between the plane and the ground beside it at most."""
+"""Metres between the plane and the ground at most."""
 REACH = 3.0
-"""Metres around a place in which the ground says how high it is there."""
+"""Metres around a place in which cells say how high it is there."""
+ITERATIONS = 5
 
 
-def ground_points(points: Tensor) -> Tensor:
-    """Of points (N, 3 or more) those (G, 3) float64 that may lie on the ground: a low one of every cell."""
-    xyz = points[:, :3].double()
-    xyz = xyz[xyz.isfinite().all(dim=1)]
-    cell = (xyz[:, :2] / CELL).floor().long()
-    key = cell[:, 0] * 2**24 + cell[:, 1]
-    by_height = xyz[:, 2].argsort(stable=True)
-    order = by_height[key[by_height].argsort(stable=True)]
-    _, count = key[order].unique_consecutive(return_counts=True)
-    low = count.cumsum(0) - count + (LOW * (count - 1)).long()
-    return xyz[order[low[count >= FEWEST]]]
+def ground_map(points: Tensor, reach: float) -> Tensor:
+    """Heights of the ground under clouds (B, N, 3 or more) within `reach` metres along x and y of the sensor.
 
+    Returns (B, S, S) float32 at the centres of cells of 2 m, x first; NaN where no ground is found. Points that are not
+    finite are ignored.
 
-def ground_under(ground: Tensor, places: Tensor) -> Tensor:
-    """Heights (M,) float64 of the ground at places (M, 2), by the points (G, 3) of `ground_points`; NaN for too few.
-
-    A plane is fitted to the lower ones, which walls and roofs are not among; then what the points nearby leave of it is
-    added, the lower ones with more weight.
+    A plane is fitted to a low point of every cell, the lower ones with more weight; then the cells nearby add what they
+    differ from it. Walls, cars and what is seen above a cell's ground rise too far from the plane to count.
     """
-    ground, places = ground.double(), places.double()
-    rows = torch.cat((ground[:, :2], torch.ones_like(ground[:, :1])), dim=1)
-    height = ground[:, 2]
-    weight = ((height - height.median()).abs() < SPREAD).to(height.dtype) if len(height) else height
-    if weight.sum() < 6:
-        return places.new_full((len(places),), torch.nan)
-    # level where the points lie on a line and say nothing across it
-    level = torch.diag(height.new_tensor([1.0, 1.0, 1e-5]))
-    for _ in range(6):
-        weighed = rows.T * weight
-        plane = torch.linalg.solve(weighed @ rows + level, weighed @ height)
-        left = height - rows @ plane
-        weight = 1 / (1 + (left / torch.where(left > 0, NOISE, 2 * NOISE)).pow(4))
-    near = left.abs() < LARGEST
-    left, ground = left[near], ground[near]
-    weight = torch.exp(-torch.cdist(places, ground[:, :2]).square() / (2 * REACH**2))
-    weight = weight * torch.exp(-left.clamp(min=0) / NOISE)
-    residual = (weight @ left) / (weight.sum(dim=1) + LOW)
-    return places @ plane[:2] + plane[2] + residual
+    side = cells_of(reach)
+    heights = _low_heights(points, side).double()
+    centre = (torch.arange(side, device=points.device, dtype=torch.float64) - (side - 1) / 2) * CELL
+    rows = torch.stack(
+        (centre.repeat_interleave(side), centre.repeat(side), torch.ones_like(centre).repeat(side)), dim=1
+    )
+    weight = ((heights - heights.nanmedian(dim=1, keepdim=True).values).abs() < SPREAD).double()
+    found = weight.sum(dim=1) >= FEWEST_CELLS
+    # level where the cells lie on a line and say nothing across it
+    level = torch.eye(3, dtype=torch.float64, device=points.device)
+    level[2, 2] = 1e-5
+    known = heights.nan_to_num(0.0)
+    for _ in range(ITERATIONS):
+        weighed = rows.T * weight[:, None]  # (B, 3, S S)
+        plane = solve(weighed @ rows + level, (weighed @ known[:, :, None]).squeeze(2))
+        left = heights - plane @ rows.T
+        weight = (1 / (1 + (left / torch.where(left > 0, NOISE, 2 * NOISE)).pow(4))).nan_to_num(0.0)
+    weight = torch.exp(-left.clamp(min=0) / NOISE).where(left.abs() < LARGEST, 0.0)
+    near = torch.exp(-(centre[:, None] - centre).square() / (2 * REACH**2))
+    weight, weighed = (
+        near @ each.unflatten(1, (side, side)) @ near for each in (weight, weight * left.nan_to_num(0.0))
+    )
+    ground = (plane @ rows.T).unflatten(1, (side, side)) + weighed / (weight + 0.05)
+    return ground.where(found[:, None, None], math.nan).float()
+
+
+def heights_at(ground: Tensor, places: Tensor) -> Tensor:
+    """Heights (B, P) of maps (B, S, S) of `ground_map` at places (B, P, 2), metres: between its cells' centres linear."""
+    half = ground.shape[1] * CELL / 2
+    at = (places / half).nan_to_num(0.0).flip(2)[:, None].to(ground.dtype)  # (B, 1, P, 2), y first
+    return F.grid_sample(ground[:, None], at, padding_mode="border", align_corners=False)[:, 0, 0]
+
+
+def reach_of(point_range: Sequence[float]) -> float:
+    """How far a range x_min, y_min, z_min, x_max, y_max, z_max reaches along x and y, in either direction, metres."""
+    return max(abs(point_range[k]) for k in (0, 1, 3, 4))
+
+
+def flatten(points: Tensor, boxes: Tensor, wanted: float, point_range: Sequence[float]) -> tuple[Tensor, Tensor]:
+    """Points (N, 4) and boxes (M, 7) of a frame, raised and lowered so that the ground under them lies at a height.
+
+    Where no ground is found they stay as they are.
+    """
+    ground = ground_map(points[None], reach_of(point_range))
+    moved = []
+    for rows in (points, boxes):
+        rise = (wanted - heights_at(ground, rows[None, :, :2])[0]).nan_to_num(0.0)
+        moved.append(torch.cat((rows[:, :2], rows[:, 2:3] + rise[:, None], rows[:, 3:]), dim=1))
+    return moved[0], moved[1]
+
+
+def cells_of(reach: float) -> int:
+    """Cells along a side of the map."""
+    return 2 * math.ceil(reach / CELL)
+
+
+def solve(matrix: Tensor, values: Tensor) -> Tensor:
+    """The solutions (B, 3) of symmetric systems (B, 3, 3) with values (B, 3), by Cramer's rule: LAPACK's way makes a GPU
+    wait."""
+    a, b, c = matrix.unbind(dim=1)
+    cofactors = torch.stack((torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)), dim=1)
+    return (cofactors @ values[:, :, None]).squeeze(2) / (a * cofactors[:, 0]).sum(dim=1, keepdim=True)
+
+
+def _low_heights(points: Tensor, side: int) -> Tensor:
+    """The low points' heights (B, S S) in metres in every cell of the map, NaN where a cell has too few points."""
+    batch_size, cells = len(points), side * side
+    x, y, z = points[..., :3].unbind(dim=2)
+    column, row, level = x / CELL + side / 2, y / CELL + side / 2, (z - LOWEST) * 1000
+    # false for NaN
+    seen = (column >= 0) & (column < side) & (row >= 0) & (row < side) & (level >= 0) & (level < LEVELS)
+    first = torch.arange(batch_size, device=points.device)[:, None] * cells
+    cell = (first + column.nan_to_num(0.0).long() * side + row.nan_to_num(0.0).long()).where(seen, batch_size * cells)
+    # cell and height in one number, which is sorted once
+    key = (cell * LEVELS + level.nan_to_num(0.0).long().clamp(0, LEVELS - 1)).flatten().sort().values
+    starts = torch.searchsorted(key, torch.arange(batch_size * cells + 1, device=points.device) * LEVELS)
+    counts = starts.diff()
+    if not len(key):
+        return points.new_full((batch_size, cells), math.nan)
+    low = key[(starts[:-1] + (counts - 1).clamp(min=0) // SKIPPED).clamp(max=len(key) - 1)] % LEVELS / 1000 + LOWEST
+    return low.where(counts >= FEWEST, math.nan).view(batch_size, cells)

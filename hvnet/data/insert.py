@@ -13,7 +13,6 @@ import torch
 from torch import Generator, Tensor
 
 from hvnet.boxes import boxes_collide, points_in_boxes
-from hvnet.data.ground import ground_under
 from hvnet.data.gt_database import Database, object_points
 from hvnet.kernels.launch import many_threads
 
@@ -66,7 +65,7 @@ def sample_objects(
     counts: Mapping[str, int],
     generator: Generator,
     classes: Sequence[str],
-    ground: Tensor | None = None,
+    ground: float | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Ground-truth sampling of SECOND: inserts objects of other frames at their original positions.
 
@@ -92,7 +91,7 @@ def sample_frame(
     objects: ObjectSampler,
     generator: Generator,
     classes: Sequence[str],
-    ground: Tensor | None = None,
+    ground: float | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Inserts all objects of one frame of the database into points (N, 4), boxes (M, 7) and labels (M,).
 
@@ -110,19 +109,18 @@ def _insert(
     objects: ObjectSampler,
     drawn: np.ndarray,
     drawn_labels: Sequence[int],
-    ground: Tensor | None,
+    ground: float | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Inserts rows of the database, in this order, into a frame.
 
     An object that collides in bird's eye view with a box of the frame or with one inserted before is skipped, not
-    replaced. Points of the frame inside an inserted box give way to the object's own. Where the ground (G, 3) is known,
-    an object is raised or lowered to stand on it.
+    replaced. Points of the frame inside an inserted box give way to the object's own. On a flat ground an object is
+    raised or lowered to stand on it.
     """
     drawn_boxes = torch.from_numpy(objects.database.box[drawn])
     rise = torch.zeros(len(drawn))
     if ground is not None:
-        bottom = drawn_boxes[:, 2] - drawn_boxes[:, 5] / 2
-        rise = (ground_under(ground, drawn_boxes[:, :2]) - bottom).nan_to_num(0.0).float()
+        rise = ground - (drawn_boxes[:, 2] - drawn_boxes[:, 5] / 2)
         drawn_boxes = drawn_boxes.clone()
         drawn_boxes[:, 2] += rise
     collides = boxes_collide(drawn_boxes, torch.cat((boxes, drawn_boxes))).numpy()

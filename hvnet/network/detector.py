@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from hvnet.boxes import limit_angle
+from hvnet.data.ground import cells_of, ground_map, heights_at, reach_of
 from hvnet.data.sensor import (
     FEW_IN_RANGE,
     Look,
@@ -59,8 +60,17 @@ class Placed(NamedTuple):
 
     clouds: list[Tensor]  # of every direction the points (N, 4), turned so that it is along x
     shift: Tensor  # () metres by which they were raised
+    relief: Tensor | None  # (S, S) metres by which they were then lowered, see `ground_map`; None: by none
     ground: Tensor  # () height of the ground before that, NaN where none was found
     bright: Tensor  # () a reflectance that is too large, 0 if none is
+
+
+class Move(NamedTuple):
+    """What was done to a cloud before detection, and what was seen of it."""
+
+    bright: float  # a reflectance that is too large, 0 if none is
+    shift: float  # metres by which it was raised
+    relief: Tensor | None  # (S, S) metres by which it was then lowered, on the host
 
 
 class Candidates(NamedTuple):
@@ -101,6 +111,8 @@ class Detector:
         if not _is_number(turn):
             raise ValueError(f"turn: want degrees, got {turn!r}")
         self.ground, self.reflectance, self.sensor_height = ground, reflectance, sensor_height
+        self.is_flat = model.config.encoder.flat_ground and ground is not None
+        self.reach = reach_of(model.config.encoder.point_range)
         turns = 1 if not all_round else turns_all_round(model.config.encoder.point_range)
         self.turns = [math.radians((turn + 360 * k / turns) % 360) for k in range(turns)]
         self.device = device
@@ -142,18 +154,16 @@ class Detector:
         if not clouds:
             return []
         with torch.cuda.device(self.device) if self.device.type == "cuda" else contextlib.nullcontext():
-            found, bright, shift = (
-                self.batch_of_many(clouds) if many_threads(self.device) else self.batch_of_one(clouds)
-            )
+            found, moves = self.batch_of_many(clouds) if many_threads(self.device) else self.batch_of_one(clouds)
         results = []
-        for k, (brightest, raised) in enumerate(zip(bright, shift, strict=True)):
-            if brightest:
-                raise ValueError(reflectance_error(brightest))
-            results.append(self.take_back(found[k * len(self.turns) : (k + 1) * len(self.turns)], raised))
+        for k, move in enumerate(moves):
+            if move.bright:
+                raise ValueError(reflectance_error(move.bright))
+            results.append(self.take_back(found[k * len(self.turns) : (k + 1) * len(self.turns)], move))
         return results
 
-    def batch_of_one(self, clouds: Sequence[Tensor | NDArray]) -> tuple[list[Detections], list[float], list[float]]:
-        """What one thread finds in every direction of every cloud (N, 4), their brightest reflectances and shifts."""
+    def batch_of_one(self, clouds: Sequence[Tensor | NDArray]) -> tuple[list[Detections], list[Move]]:
+        """What one thread finds in every direction of every cloud (N, 4), and how it has moved them."""
         placed = [self.place(cloud) for cloud in clouds]
         parts = [part for each in placed for part in each.clouds]
         points = torch.cat(parts)
@@ -161,9 +171,9 @@ class Detector:
         sample = torch.repeat_interleave(torch.arange(len(parts)), lengths).to(self.device)
         levels, scores = self.maps(points, sample, len(parts))
         found = self.suppress(self.candidates(levels, scores))
-        return found, [float(each.bright) for each in placed], [float(each.shift) for each in placed]
+        return found, [Move(float(each.bright), float(each.shift), each.relief) for each in placed]
 
-    def batch_of_many(self, clouds: Sequence[Tensor | NDArray]) -> tuple[list[Detections], list[float], list[float]]:
+    def batch_of_many(self, clouds: Sequence[Tensor | NDArray]) -> tuple[list[Detections], list[Move]]:
         """The same by many threads."""
         checked = [check_points(cloud) for cloud in clouds]
         key = len(checked), capacity_of(checked)
@@ -175,22 +185,40 @@ class Detector:
                 frame.capture(self.numbers)
             self.frames[key] = frame
         output = self.frames[key](checked, self.numbers)
-        bright, shift = output[-2 * len(checked) :].view(2, -1).tolist()
         size = (len(checked) * len(self.turns), len(self.classes), self.steps.kept, COLUMNS)
-        return detections(output[: math.prod(size)].view(size)), bright, shift
+        table, moves = output.split((math.prod(size), len(output) - math.prod(size)))
+        (bright, shift), reliefs = moves[: 2 * len(checked)].view(2, -1).tolist(), [None] * len(checked)
+        if self.is_flat:
+            reliefs = list(moves[2 * len(checked) :].view(len(checked), cells_of(self.reach), -1))
+        return detections(table.view(size)), [Move(*each) for each in zip(bright, shift, reliefs, strict=True)]
 
     def numbers(self, points: Tensor, counts: Tensor, sample: Tensor) -> Tensor:
         """By many threads all that is found in clouds (B, N, 4) of counts (B,) int32, in one row: the table of
-        `BoxSteps.suppress`, and for every cloud its brightest reflectance and its shift.
+        `BoxSteps.suppress`, for every cloud its brightest reflectance, its shift and, if it was flattened, its relief.
 
         sample: the direction of a cloud (B T N,) int64 that each point is turned to.
         """
-        shift = self.shifts(points, counts)
+        shift, reliefs = self.shifts(points, counts), []
+        if self.is_flat:
+            missing = torch.arange(points.shape[1], device=self.device) >= counts[:, None]
+            heights = points[..., 2] + shift[:, None]
+            xyz = torch.cat((points[..., :2], heights.masked_fill(missing, math.nan)[..., None]), dim=2)
+            relief = self.relief(xyz)
+            lowered = points[..., 2] - heights_at(relief, points[..., :2])
+            points = torch.cat((points[..., :2], lowered[..., None], points[..., 3:]), dim=2)
+            reliefs = [relief.flatten()]
         point_range = self.config.encoder.point_range
         placed, bright = place_points(points, counts, shift, self.cosines, point_range, self.reflectance)
         levels = self.backbone(self.encode(placed.view(-1, 4), sample, len(points) * len(self.turns)))
         table = self.steps.suppress(self.steps.candidates(levels, self.steps.keys(self.score_maps(levels))))
-        return torch.cat((table.flatten(), bright, shift))
+        return torch.cat((table.flatten(), bright, shift, *reliefs))
+
+    def relief(self, points: Tensor) -> Tensor:
+        """By how many metres the ground under clouds (B, N, 3 or more) is above that of the training data: (B, S, S).
+
+        0 where no ground is found.
+        """
+        return (ground_map(points, self.reach) - (self.ground or 0.0)).nan_to_num(0.0)
 
     def shifts(self, points: Tensor, counts: Tensor) -> Tensor:
         """By many threads the metres (B,) by which clouds (B, N, 4) of counts (B,) int32 are raised."""
@@ -212,9 +240,15 @@ class Detector:
             shift = shift_to(ground, self.ground)  # 0 where the ground is NaN
             if many_threads(self.device) or shift:  # a GPU is not asked
                 points = torch.cat((points[:, :2], points[:, 2:3] + shift, points[:, 3:]), dim=1)
+        relief = None
+        if self.is_flat:
+            relief = self.relief(points[None])
+            lowered = points[:, 2:3] - heights_at(relief, points[None, :, :2])[0, :, None]
+            points = torch.cat((points[:, :2], lowered, points[:, 3:]), dim=1)
+            relief = relief[0]
         clouds = [turned(points, angle) for angle in self.turns]
         bright = torch.stack([too_bright(each, self.config.encoder.point_range) for each in clouds]).amax()
-        return Placed(clouds, shift, ground, bright)
+        return Placed(clouds, shift, relief, ground, bright)
 
     def look(self, cloud: Tensor | NDArray) -> Look:
         """What the detector sees of a cloud (N, 4)."""
@@ -237,9 +271,9 @@ class Detector:
         low, high = around.amin(dim=0).tolist(), around.amax(dim=0).tolist()
         return *low, z_min - shift, *high, z_max - shift
 
-    def take_back(self, found: Sequence[Detections], shift: float) -> Detections:
+    def take_back(self, found: Sequence[Detections], move: Move) -> Detections:
         """The boxes of a cloud, found in every direction, in its own axes: those straight ahead, joined by NMS."""
-        if len(self.turns) == 1 and not self.turns[0] and not shift:
+        if len(self.turns) == 1 and not self.turns[0] and not move.shift and move.relief is None:
             return found[0]
         parts = []
         for each, angle in zip(found, self.turns, strict=True):
@@ -249,7 +283,10 @@ class Detector:
                 beyond = torch.hypot(x, y) * sideways.clamp(0, math.pi / 2).sin()  # metres
                 each = each.select(beyond <= SEAM)
             boxes = turned(each.boxes, -angle)
-            boxes[:, 2] -= shift
+            if move.relief is not None:
+                boxes = boxes.clone()
+                boxes[:, 2] += heights_at(move.relief[None], boxes[None, :, :2])[0]
+            boxes[:, 2] -= move.shift
             boxes[:, 6] = limit_angle(boxes[:, 6] - angle)
             parts.append(each._replace(boxes=boxes))
         joined = Detections(*(torch.cat(column) for column in zip(*parts, strict=True)))

@@ -15,12 +15,11 @@ from torch.utils.data import Dataset, Sampler
 from tqdm import tqdm
 
 from hvnet import ranks
-from hvnet.boxes import points_in_boxes
 from hvnet.config import Config
 from hvnet.data.augment import augment, mix_sectors
 from hvnet.data.drives import drive_weights, read_drives
 from hvnet.data.frame import Frame, Frames, check_names, frame_at, object_names
-from hvnet.data.ground import ground_points
+from hvnet.data.ground import flatten
 from hvnet.data.gt_database import Database, build_database, load_database
 from hvnet.data.insert import ObjectSampler, send
 from hvnet.data.kitti import KittiFrames, read_split_frames
@@ -108,17 +107,6 @@ class Sample(NamedTuple):
     name: str
 
 
-class TrainingFrame(NamedTuple):
-    """A frame as it is read."""
-
-    points: Tensor  # (N, 4), on the GPU when training on one
-    boxes: Tensor  # (M, 7)
-    labels: Tensor  # (M,) int64, index into the config's classes, or -1
-    ground: Tensor  # (G, 3) of `ground_points`; none unless inserted objects stand on it
-    note: str
-    name: str
-
-
 class TrainingFrames(Dataset[Sample | InputError]):
     """Frames augmented on a device; item (epoch, k) depends on the seed, the epoch and k alone.
 
@@ -132,11 +120,14 @@ class TrainingFrames(Dataset[Sample | InputError]):
         objects: ObjectSampler | None,
         device: torch.device,
         drives: Sequence[str] = (),
+        ground: float | None = None,
     ) -> None:
+        """ground: the height that the ground of every frame is brought to; None: they stay as they are."""
+        self.ground = ground
         self.frames, self.config, self.objects, self.device = frames, config, objects, device
         self.weights = drive_weights(drives)
         self.classes = [entry.name for entry in config.head.classes]
-        self.kept: dict[int, TrainingFrame] = {}
+        self.kept: dict[int, Sample] = {}
 
     def __getitem__(self, item: tuple[int, int]) -> Sample | InputError:
         try:
@@ -149,24 +140,24 @@ class TrainingFrames(Dataset[Sample | InputError]):
         options = self.config.augment
         generator = seeded(self.config.train.seed, epoch, k)
         frame = self.read(k % len(self.frames))
-        points, boxes, labels, ground, note, name = frame
+        points, boxes, labels, note, name = frame
         if options.mix and torch.rand((), generator=generator).item() < options.mix:
             if len(self.weights):
                 drawn = torch.multinomial(self.weights, 1, generator=generator)
             else:
                 drawn = torch.randint(len(self.frames), (), generator=generator)
             other = self.read(int(drawn))
-            points, boxes, labels, ground = mix_sectors(points, boxes, labels, ground, other[:4], generator)
+            points, boxes, labels = mix_sectors(points, boxes, labels, other[:3], generator)
             note = "\n".join(filter(None, (note, other.note)))
         # inserted objects are too many, and stand where none would be: the last epochs see streets as they are
         faded = epoch >= self.config.train.epochs - options.fade_out
         objects = None if faded else self.objects
-        points, boxes, labels = augment(points, boxes, labels, ground, objects, options, generator, self.classes)
+        points, boxes, labels = augment(points, boxes, labels, objects, options, generator, self.classes, self.ground)
         low, high = boxes.new_tensor(self.config.encoder.point_range).view(2, 3)
         inside = ((boxes[:, :2] >= low[:2]) & (boxes[:, :2] < high[:2])).all(dim=1) & (labels >= 0)
         return Sample(points, boxes[inside], labels[inside], note, name)
 
-    def read(self, k: int) -> TrainingFrame:
+    def read(self, k: int) -> Sample:
         """Frame k as it is; boxes of classes that are not trained have label -1.
 
         Where frames that cannot be read are to be skipped, the next one that can be takes the place.
@@ -193,14 +184,14 @@ class TrainingFrames(Dataset[Sample | InputError]):
             self.kept[k] = sample
         return sample
 
-    def sample_of(self, frame: Frame, note: str) -> TrainingFrame:
+    def sample_of(self, frame: Frame, note: str) -> Sample:
         """The frame on the device, its classes by number."""
         assert frame.objects is not None
         labels = [self.classes.index(name) if name in self.classes else -1 for name in frame.objects.names]
-        points, boxes, ground = frame.points, frame.objects.boxes, torch.zeros(0, 3)
-        if self.config.augment.on_ground:
-            ground = ground_points(points[~points_in_boxes(points, boxes).any(dim=1)])
-        return TrainingFrame(points.to(self.device), boxes, torch.tensor(labels).long(), ground, note, frame.name)
+        points, boxes = frame.points, frame.objects.boxes
+        if self.ground is not None:
+            points, boxes = flatten(points, boxes, self.ground, self.config.encoder.point_range)
+        return Sample(points.to(self.device), boxes, torch.tensor(labels).long(), note, frame.name)
 
 
 class EpochOrder(Sampler[list[tuple[int, int]]]):

@@ -170,8 +170,13 @@ class Run:
         objects = None
         if config.augment.objects or config.augment.whole_frames:
             objects = sampler_of(training_objects(data, good, self.say), place)
+        ground = self.sensor["ground"] if config.encoder.flat_ground else None
+        if config.encoder.flat_ground and ground is None:
+            raise InputError(
+                "no ground is found in the clouds; give data.sensor_height, or train with encoder.flat_ground=false"
+            )
         return DataLoader(
-            TrainingFrames(data.train, config, objects, place, data.drives),
+            TrainingFrames(data.train, config, objects, place, data.drives, ground),
             batch_sampler=order,
             collate_fn=collate,
             generator=torch.Generator(),  # otherwise every new epoch would draw from torch's global generator
@@ -325,7 +330,8 @@ class Run:
 
     def validate(self) -> dict[str, dict[str, Any]]:
         """Detects in the validation frames, scores the boxes by KITTI's protocol and draws the first few frames."""
-        detector = Detector(self.averaged or self.model, self.device)
+        ground = self.sensor["ground"] if self.config.encoder.flat_ground else None
+        detector = Detector(self.averaged or self.model, self.device, ground=ground, sensor_height="none")
         classes, point_range = detector.classes, self.config.encoder.point_range
 
         def draw(detected: Detected) -> None:
