@@ -43,9 +43,7 @@ def ground_map(points: Tensor, reach: float) -> Tensor:
     side = cells_of(reach)
     heights = _low_heights(points, side).double()
     centre = (torch.arange(side, device=points.device, dtype=torch.float64) - (side - 1) / 2) * CELL
-    rows = torch.stack(
-        (centre.repeat_interleave(side), centre.repeat(side), torch.ones_like(centre).repeat(side)), dim=1
-    )
+    rows = torch.cat((torch.cartesian_prod(centre, centre), torch.ones_like(heights[0])[:, None]), dim=1)
     weight = ((heights - heights.nanmedian(dim=1, keepdim=True).values).abs() < SPREAD).double()
     found = weight.sum(dim=1) >= FEWEST_CELLS
     # level where the cells lie on a line and say nothing across it
@@ -59,15 +57,14 @@ def ground_map(points: Tensor, reach: float) -> Tensor:
         weight = (1 / (1 + (left / torch.where(left > 0, NOISE, 2 * NOISE)).pow(4))).nan_to_num(0.0)
     weight = torch.exp(-left.clamp(min=0) / NOISE).where(left.abs() < LARGEST, 0.0)
     near = torch.exp(-(centre[:, None] - centre).square() / (2 * REACH**2))
-    weight, weighed = (
-        near @ each.unflatten(1, (side, side)) @ near for each in (weight, weight * left.nan_to_num(0.0))
-    )
+    both = torch.stack((weight, weight * left.nan_to_num(0.0))).unflatten(2, (side, side))
+    weight, weighed = (near @ both @ near).unbind(0)
     ground = (plane @ rows.T).unflatten(1, (side, side)) + weighed / (weight + 0.05)
     return ground.where(found[:, None, None], math.nan).float()
 
 
 def heights_at(ground: Tensor, places: Tensor) -> Tensor:
-    """Heights (B, P) of maps (B, S, S) of `ground_map` at places (B, P, 2), metres: between its cells' centres linear."""
+    """Heights (B, P) of maps (B, S, S) of `ground_map` at places (B, P, 2), metres, linear between cells' centres."""
     half = ground.shape[1] * CELL / 2
     at = (places / half).nan_to_num(0.0).flip(2)[:, None].to(ground.dtype)  # (B, 1, P, 2), y first
     return F.grid_sample(ground[:, None], at, padding_mode="border", align_corners=False)[:, 0, 0]
@@ -97,8 +94,10 @@ def cells_of(reach: float) -> int:
 
 
 def solve(matrix: Tensor, values: Tensor) -> Tensor:
-    """The solutions (B, 3) of symmetric systems (B, 3, 3) with values (B, 3), by Cramer's rule: LAPACK's way makes a GPU
-    wait."""
+    """The solutions (B, 3) of symmetric systems (B, 3, 3) with values (B, 3).
+
+    By Cramer's rule, as the host would wait for a GPU's LAPACK.
+    """
     a, b, c = matrix.unbind(dim=1)
     cofactors = torch.stack((torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)), dim=1)
     return (cofactors @ values[:, :, None]).squeeze(2) / (a * cofactors[:, 0]).sum(dim=1, keepdim=True)
