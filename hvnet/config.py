@@ -108,6 +108,11 @@ class AugmentConfig:
     whole_frames: float = 0.0  # probability that all objects of one frame of the database are inserted instead
     fade_out: int = 0  # last epochs of a run in which no object is inserted
     mix: float = 0.0  # probability that a sector of the frame is taken from another frame
+    # frames as other sensors see them
+    fewer_beams: float = 0.0  # probability that beams of an HDL-64E are left out
+    no_reflectance: float = 0.0  # probability that the reflectance is 0, as where a sensor has none
+    reflectance: tuple[float, float] = (1.0, 1.0)  # limits of a factor for the reflectance, which stays below 1
+    pitch: float = 0.0  # about the y axis, uniform in [-pitch, pitch], radians
 
 
 @dataclass(frozen=True)
@@ -376,10 +381,11 @@ CHECKS = (
     Check("head.classes", "focal_gamma", "0 or more", lambda v: v >= 0),
     Check("loss", "localization classification vertical direction iou", "0 or more", lambda v: v >= 0),
     Check("loss", "beta", "above 0", lambda v: v > 0),
-    Check("augment", "flip whole_frames mix", "between 0 and 1", lambda v: 0 <= v <= 1),
+    Check("augment", "flip whole_frames mix fewer_beams no_reflectance", "between 0 and 1", lambda v: 0 <= v <= 1),
     Check("augment", "fade_out", "0 (none) or more", lambda v: v >= 0),
     Check("augment", "rotation", "0 or more", lambda v: v >= 0),
-    Check("augment", "scaling", "0 < low <= high", lambda v: 0 < v[0] <= v[1]),
+    Check("augment", "pitch", "0 to 0.2 (11 degrees)", lambda v: 0 <= v <= 0.2),
+    Check("augment", "scaling reflectance", "0 < low <= high", lambda v: 0 < v[0] <= v[1]),
     Check("augment", "translation", "0 or more", lambda v: min(v) >= 0),
     Check("data", "columns", COLUMNS, lambda v: not v or are_columns(v)),
     Check("data", "reflectance_scale", "above 0, or 0 for none", lambda v: v is None or v >= 0),

@@ -13,6 +13,7 @@ from torch import Generator, Tensor
 from hvnet.boxes import limit_angle, points_in_boxes
 from hvnet.config import AugmentConfig
 from hvnet.data.insert import ObjectSampler, drop, sample_frame, sample_objects, send
+from hvnet.data.other_sensors import random_pitch, random_reflectance, unseen_by_fewer_beams
 
 
 def augment(
@@ -42,6 +43,11 @@ def augment(
             points, boxes, labels = sample_objects(
                 points, boxes, labels, objects, options.objects, generator, classes, ground
             )
+    # after the insertion, and before a point leaves the beam that saw it
+    if options.fewer_beams and torch.rand((), generator=generator).item() < options.fewer_beams:
+        points = drop(points, unseen_by_fewer_beams(points, generator))
+    points = random_reflectance(points, options.no_reflectance, options.reflectance, generator)
+    points, boxes = random_pitch(points, boxes, options.pitch, generator)
     points, boxes = random_flip(points, boxes, options.flip, generator)
     points, boxes = random_rotation(points, boxes, options.rotation, generator)
     points, boxes = random_scaling(points, boxes, options.scaling, generator)
