@@ -12,6 +12,7 @@ from typing import Any, Literal
 from hvnet.config import DataConfig
 from hvnet.data.columns import parse_columns
 from hvnet.data.labels import class_map
+from hvnet.evaluation.bootstrap import CONFIDENCE, MIN_RESAMPLES, Resampling, read_groups, resample
 from hvnet.exceptions import InputError, Stopped
 
 MAX_SENSOR_HEIGHT = 1000.0  # metres; below 0 where heights are those of a map
@@ -173,6 +174,42 @@ def read_overlaps(given: Sequence[str], classes: Sequence[str]) -> dict[str, flo
             raise InputError(f"--overlap {text}: no class {name}; there are {', '.join(classes)}")
         overlaps[name] = value
     return overlaps
+
+
+def add_bootstrap(parser: argparse.ArgumentParser) -> None:
+    """The options --bootstrap, --groups and --seed; see `read_bootstrap`."""
+    parser.add_argument(
+        "--bootstrap",
+        type=int,
+        metavar="N",
+        help=f"give every AP its {CONFIDENCE} %% interval, of N resamples of the frames such as 1000",
+    )
+    parser.add_argument(
+        "--groups",
+        type=Path,
+        metavar="FILE",
+        help="draw the frames of a drive together; a CSV file with the columns frame and drive",
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the resamples (default: 0)")
+
+
+def read_bootstrap(options: argparse.Namespace, frames: Sequence[str]) -> Resampling | None:
+    """The resamples of frames that the options of `add_bootstrap` ask for, None without them.
+
+    Raises InputError for a value that means nothing, and for a frame that is in no group.
+    """
+    count, groups, seed = options.bootstrap, options.groups, options.seed
+    if count is None:
+        if groups is not None:
+            raise InputError(f"--groups {groups}: is for --bootstrap N; add it")
+        return None
+    if count < MIN_RESAMPLES:
+        raise InputError(f"--bootstrap {count}: want {MIN_RESAMPLES} resamples or more, such as 1000")
+    if seed < 0:
+        raise InputError(f"--seed {seed}: want 0 or more")
+    if not frames:
+        raise InputError(f"--bootstrap {count}: no frame has labels, so nothing is scored; leave it out")
+    return resample(count, frames if groups is None else read_groups(groups, frames), seed=seed)
 
 
 def add_changes(parser: argparse.ArgumentParser, what: str) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from hvnet.cli import (
+    add_bootstrap,
     add_checkpoint,
     add_device,
     add_inputs,
@@ -22,6 +23,7 @@ from hvnet.cli import (
     add_overlaps,
     add_reading,
     make_parser,
+    read_bootstrap,
     read_mount,
     read_overlaps,
     read_reading,
@@ -33,6 +35,7 @@ from hvnet.data.kitti import IMAGES, KittiFrames, find_file, frame_labels, has_c
 from hvnet.data.labels import Labels
 from hvnet.data.sensor import summary
 from hvnet.data.sources import find_frames
+from hvnet.evaluation.bootstrap import Resampling
 from hvnet.evaluation.precision import evaluate
 from hvnet.evaluation.rules import KITTI, Rule, config_rules
 from hvnet.evaluation.scoring import background_note, detect_frames, look_at, print_once
@@ -155,13 +158,19 @@ def detect(
 
 
 def print_scores(
-    detector: Detector, frames: Frames, truths: dict[str, Labels], results: Path, rules: dict[str, Rule]
+    detector: Detector,
+    frames: Frames,
+    truths: dict[str, Labels],
+    results: Path,
+    rules: dict[str, Rule],
+    resampling: Resampling | None,
 ) -> None:
     """Scores the results of the frames that have labels, and says which have none."""
     names = [name for name in frames.names if name in truths]
     if names:
         written = [read_labels(results / f"{name}.txt", scored=True) for name in names]
-        table = evaluate([truths[name] for name in names], written, classes=detector.classes, rules=rules)
+        labels = [truths[name] for name in names]
+        table = evaluate(labels, written, classes=detector.classes, rules=rules, resampling=resampling)
         print(format_table(table) + "\n")
         if without := [name for name in frames.names if name not in truths]:
             shown = ", ".join(without[:5]) + (", ..." if len(without) > 5 else "")
@@ -184,6 +193,7 @@ def main(arguments: Sequence[str] | None) -> None:
             "cloud.pcd --checkpoint runs/demo/checkpoint.pt",
             "clouds/ --pictures 0",
             "/data/kitti --split val --out val",
+            "/data/kitti --split val --out val --bootstrap 1000 --groups drives.csv",
             "/data/kitti --split test --checkpoint runs/hvnet/checkpoint.pt --out test",
         ],
     )
@@ -204,6 +214,7 @@ def main(arguments: Sequence[str] | None) -> None:
     add_reading(parser)
     add_mount(parser)
     add_overlaps(parser)
+    add_bootstrap(parser)
     add_device(parser)
     options = parser.parse_args(arguments)
 
@@ -230,9 +241,11 @@ def main(arguments: Sequence[str] | None) -> None:
     rules = config_rules(detector.config, read_overlaps(options.overlap, detector.classes))
     seen: set[str] = set()  # what was printed
     # labels are looked at before minutes of work, and stop none of it
-    print_once((part.labels(k)[1] for part in roots for k in range(len(part))), seen)
+    labels = {part.names[k]: part.labels(k) for part in roots for k in range(len(part))}
+    print_once((note for _, note in labels.values()), seen)
+    resampling = read_bootstrap(options, [name for name, (rows, _) in labels.items() if rows is not None])
     total, truths = detect(detector, frames, options.out, options.pictures, submit, verbose=options.verbose, seen=seen)
-    print_scores(detector, frames, truths, options.out / "results", rules)
+    print_scores(detector, frames, truths, options.out / "results", rules, resampling)
     print(f"{total} boxes in {len(frames)} cloud{'s' * (len(frames) != 1)}")
     print(f"results:    {options.out / 'results'}\nboxes:      {options.out / 'boxes.csv'}")
     if options.pictures > 0:

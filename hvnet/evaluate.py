@@ -6,18 +6,31 @@ import math
 import textwrap
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
-from hvnet.cli import add_columns, add_overlaps, make_parser, read_overlaps, run_command
+from hvnet.cli import (
+    add_bootstrap,
+    add_columns,
+    add_overlaps,
+    make_parser,
+    read_bootstrap,
+    read_overlaps,
+    run_command,
+)
 from hvnet.data.columns import parse_columns
 from hvnet.data.kitti import TYPES
 from hvnet.data.labels import DONTCARE, Labels, class_map, count_others, rename
+from hvnet.evaluation.bootstrap import CONFIDENCE, differences
 from hvnet.evaluation.folders import Folders, check_axes, read_folders, read_point_counts
 from hvnet.evaluation.matching import LEVELS_WITHOUT_2D, Level, distance_levels
 from hvnet.evaluation.precision import evaluate
 from hvnet.evaluation.rules import KITTI, rule_for
-from hvnet.evaluation.tables import format_table, plot, write_csv
+from hvnet.evaluation.tables import format_differences, format_table, plot, write_csv
 from hvnet.exceptions import InputError
+
+ARRAYS = ("curves", "resampled")
+"""What a result holds besides the figures of its JSON."""
 
 
 def _band(text: str) -> tuple[float, float]:
@@ -75,6 +88,13 @@ def rename_all(folders: Folders, renamed: Mapping[str, str]) -> Folders:
     )
 
 
+def _read_folders(args: argparse.Namespace, predictions: Path) -> Folders:
+    folders = read_folders(args.labels, predictions, args.frames, args.missing_as_empty)
+    if not args.same_axes:
+        check_axes(args.labels, predictions, folders)
+    return folders
+
+
 def main(argv: Sequence[str] | None) -> None:
     """The command `python -m hvnet.evaluate`."""
     parser = make_parser(
@@ -88,6 +108,8 @@ def main(argv: Sequence[str] | None) -> None:
             "--labels labels --predictions results --score 0.5 --classes Car",
             "--labels labels --predictions results --classes Truck --overlap Truck=0.5",
             "--labels labels --predictions results --classes Car bicycle=Cyclist",
+            "--labels labels --predictions results --bootstrap 1000 --groups drives.csv",
+            "--labels labels --predictions results --bootstrap 1000 --against other_results",
         ],
     )
     parser.add_argument("--labels", type=Path, required=True, metavar="DIR", help="label files (KITTI's label_2)")
@@ -132,6 +154,13 @@ def main(argv: Sequence[str] | None) -> None:
         help="folder with velodyne/ and calib/ (none without a camera): adds the recall by number of points in the box",
     )
     add_columns(parser)
+    add_bootstrap(parser)
+    parser.add_argument(
+        "--against",
+        type=Path,
+        metavar="DIR",
+        help="other results of the same frames: how much higher the AP is than theirs (with --bootstrap)",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write the precision-recall curves")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw these curves (.png, .pdf, .svg)")
@@ -144,30 +173,40 @@ def main(argv: Sequence[str] | None) -> None:
     if args.distance_bands:
         levels = distance_levels(args.distance_bands)
     given, renamed = read_classes(args.classes)
-    folders = read_folders(args.labels, args.predictions, args.frames, args.missing_as_empty)
-    if not args.same_axes:
-        check_axes(args.labels, args.predictions, folders)
+    if args.against and args.bootstrap is None:
+        raise InputError(f"--against {args.against}: is for --bootstrap N; add it")
+    folders = _read_folders(args, args.predictions)
+    against = _read_folders(args, args.against).predictions if args.against else None
     frames, labels, predictions, missing = rename_all(folders, renamed)
+    resampling = read_bootstrap(args, frames)
     classes = choose_classes(given, labels, predictions)
     overlaps = read_overlaps(args.overlap, classes)
     columns = parse_columns(args.columns) if args.columns is not None else ()
     points = read_point_counts(args.clouds, frames, labels, columns) if args.clouds else None
-    result = evaluate(
+    score = partial(
+        evaluate,
         labels,
-        predictions,
         classes=classes,
         rules={name: rule_for(name, 0.0, overlap) for name, overlap in overlaps.items()},
         levels=levels,
         score_threshold=args.score,
         points=points,
+        resampling=resampling,
     )
+    result = score(predictions)
     print(format_table(result))
     empty = f", {len(missing)} of them without a result file, counted as empty" if missing else ""
     print(f"\n{len(frames)} frame{'s' * (len(frames) != 1)} scored{empty}")
     for what, rows in (("labels", labels), ("results", predictions)):
         if others := count_others((name for frame in rows for name in frame.name.tolist()), classes):
             print(textwrap.fill(f"{what} of classes that are not scored: {others}", 100))
-    figures = {name: {key: scored[key] for key in scored if key != "curves"} for name, scored in result.items()}
+    if against is not None:
+        found = differences(result, score([rename(frame, renamed) for frame in against]))
+        print(f"\nexact AP less that of {args.against}, in points [{CONFIDENCE} % interval]\n")
+        print(format_differences(result, found))
+        for name in found:
+            result[name]["bootstrap"]["differences"] = found[name]
+    figures = {name: {key: scored[key] for key in scored if key not in ARRAYS} for name, scored in result.items()}
     try:
         if args.json:
             args.json.write_text(json.dumps(figures, indent=1) + "\n")

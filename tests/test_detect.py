@@ -275,6 +275,30 @@ def test_labelled_frames_are_scored(
     assert table in printed
 
 
+def test_labelled_frames_are_scored_with_intervals(
+    checkpoint: Path, scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As `hvnet.evaluate` does; a mistake in the groups is said before anything is detected."""
+    groups = tmp_path / "drives.csv"
+    groups.write_text("frame,drive\n000004,a\n")
+    given = ("--bootstrap", "100", "--groups", str(groups))
+    options = ("--split", "val", "--pictures", "0", *given)
+    with pytest.raises(InputError, match=r"drives\.csv: no line for frame 000005"):
+        detect(checkpoint, tmp_path / "out", scenes, options=options)
+    assert not (tmp_path / "out").exists()
+    groups.write_text("frame,drive\n000004,a\n000005,b\n")
+    detect(checkpoint, tmp_path / "out", scenes, options=options)
+    printed = capsys.readouterr().out
+    labels, frames = scenes / "training" / "label_2", scenes / "ImageSets" / "val.txt"
+    results = tmp_path / "out" / "results"
+    evaluate.main(["--labels", str(labels), "--predictions", str(results), "--frames", str(frames), *given])
+    table = capsys.readouterr().out.partition("\n\n2 frames scored")[0]
+    assert "[low, high]: 95 % of 100 resamples of 2 frames" in table
+    assert table in printed
+    with pytest.raises(InputError, match="--bootstrap 100: no frame has labels, so nothing is scored"):
+        detect(checkpoint, tmp_path / "none", scenes / "training" / "velodyne", options=("--bootstrap", "100"))
+
+
 # --- the test set -----------------------------------------------------------------------------------------------------
 
 

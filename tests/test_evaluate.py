@@ -311,3 +311,42 @@ def test_a_mistake_is_one_line_of_the_command(folders: list[str]) -> None:
     failed = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, check=False)
     assert (failed.returncode, failed.stdout) == (2, "")
     assert failed.stderr == "error: --overlap Car=2: want CLASS=X with X above 0 and at most 1, such as Truck=0.5\n"
+
+
+def test_intervals(folders: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One car in each of two frames: found in both, and by other results in the first alone."""
+    other = shutil.copytree(tmp_path / "results", tmp_path / "other")
+    (other / "000007.txt").write_text("")
+    arguments = [*folders, "--bootstrap", "200", "--against", str(other)]
+    figures = scored(arguments, tmp_path)["Car"]
+    printed = capsys.readouterr().out
+    assert "[low, high]: 95 % of 200 resamples of 2 frames; 2, 2, 2 of them hold ground truths" in printed
+    assert re.search(r"^bev 0\.70( +100\.00 \[100\.0, 100\.0\]){3}$", printed, flags=re.MULTILINE)
+    assert re.search(r"^exact AP less that of .*other, in points \[95 % interval\]$", printed, flags=re.MULTILINE)
+    assert re.search(r"^bev 0\.70( +\+50\.00 \[0\.0, 100\.0\]){3}$", printed, flags=re.MULTILINE)
+    assert max(len(line) for line in printed.splitlines() if str(tmp_path) not in line) <= 100
+    assert figures["bootstrap"]["intervals"]["exact"]["3d"] == [[100, 100]] * 3
+    assert figures["bootstrap"]["intervals"]["loose"]["exact"]["bev"] == [[100, 100]] * 3
+    assert figures["bootstrap"]["differences"]["strict"]["3d"] == [[50, 0, 100]] * 3
+    assert (figures["bootstrap"]["resamples"], figures["bootstrap"]["groups"]) == (200, 2)
+    main(arguments)
+    assert capsys.readouterr().out == printed
+    (tmp_path / "drives.csv").write_text("frame,drive\n000003,a\n000007,a\n")
+    main([*arguments, "--groups", str(tmp_path / "drives.csv")])
+    assert re.search(r"^bev 0\.70( +\+50\.00 \[50\.0, 50\.0\]){3}$", capsys.readouterr().out, flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--bootstrap", "99"], "--bootstrap 99: want 100 resamples or more"),
+        (["--bootstrap", "100", "--seed", "-1"], "--seed -1: want 0 or more"),
+        (["--groups", "drives.csv"], r"--groups drives\.csv: is for --bootstrap N; add it"),
+        (["--against", "other"], "--against other: is for --bootstrap N; add it"),
+        (["--bootstrap", "100", "--against", "other"], "other: no such folder"),
+        (["--bootstrap", "100", "--groups", "none.csv"], r"none\.csv: cannot be read as CSV"),
+    ],
+)
+def test_bad_options_of_intervals(folders: list[str], options: list[str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        main([*folders, *options])

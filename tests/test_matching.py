@@ -15,6 +15,7 @@ from hvnet.evaluation.matching import (
     clean_data,
     count,
     find_candidates,
+    find_changes,
     found_scores,
     match_at,
 )
@@ -87,7 +88,7 @@ def candidates() -> Candidates:
 @pytest.mark.parametrize("level", LEVELS)
 def test_counts_at_every_score(candidates: Candidates, metric: str, level: Level) -> None:
     matching = clean_data(candidates, "Car", metric, 0.3, level)
-    counts = count(matching, candidates)
+    counts = count(find_changes(matching, candidates))
     assert counts.true_positives.max() >= 3
     assert (np.diff(counts.score) < 0).all()
     for k, threshold in enumerate(counts.score):
@@ -98,7 +99,7 @@ def test_counts_at_every_score(candidates: Candidates, metric: str, level: Level
 
 def test_counts_agree_with_the_matching_at_one_score(candidates: Candidates) -> None:
     matching = clean_data(candidates, "Car", "bev", 0.3, LEVELS[2])
-    counts = count(matching, candidates)
+    counts = count(find_changes(matching, candidates))
     for k, threshold in enumerate(counts.score):
         matched, taken = match_at(matching, candidates, threshold)
         assert (matching.truths & (matched < 0)).sum() == counts.misses[k]
@@ -140,7 +141,7 @@ def test_first_pass_goes_by_score_and_second_by_overlap() -> None:
     two.bbox[0, 2] = 80  # overlap 0.8
     candidates = find_candidates([car], [two])
     matching = clean_data(candidates, "Car", "2d", 0.7, LEVELS[0])
-    assert found_scores(matching, candidates).tolist() == [0.9]
+    assert found_scores(find_changes(matching, candidates)).tolist() == [0.9]
     assert match_at(matching, candidates, 0.5)[0].tolist() == [0]
     assert match_at(matching, candidates, 0.3)[0].tolist() == [1]
 
@@ -159,7 +160,8 @@ def test_no_objects_at_all() -> None:
     empty = random_frame(np.random.default_rng(0), 0, scored=True)
     candidates = find_candidates([empty, empty], [empty, empty])
     matching = clean_data(candidates, "Car", "3d", 0.7, LEVELS[0])
-    assert len(count(matching, candidates).score) == len(found_scores(matching, candidates)) == 0
+    changes = find_changes(matching, candidates)
+    assert len(count(changes).score) == len(found_scores(changes)) == 0
 
 
 def test_predictions_without_scores_are_refused() -> None:

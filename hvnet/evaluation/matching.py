@@ -2,7 +2,8 @@
 
 The devkit (evaluate_object_3d_offline; Geiger et al., CVPR 2012) matches every frame once per score threshold. Here a
 frame is matched once for every score that one of its overlapping detections has, since nothing else can change its
-counts; the running sum over all frames then holds the devkit's counts at every threshold there is.
+counts; the running sum over all frames then holds the devkit's counts at every threshold there is. A frame that is
+drawn k times in a resample counts k times in that sum, so that nothing is matched again.
 """
 
 import math
@@ -63,6 +64,9 @@ class Candidates:
     truths: Labels
     detections: Labels
     score: Floats  # (D,)
+    truth_frame: Integers  # (G,)
+    detection_frame: Integers  # (D,)
+    frames: int
     pairs: dict[str, Pairs]  # for every metric, those that overlap at all
     dontcare: Floats  # (D,) share of the detection's 2D box in the DontCare region that holds most of it
 
@@ -75,6 +79,19 @@ class Matching:
     truths: Mask  # (G,) ground truths that are found or missed; the others may be matched, but count for nothing
     ignored: Mask  # (D,) detections that may be matched, but are neither right nor wrong
     countable: Mask  # (D,) detections that are false positives where they are matched with nothing
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What each frame adds to the counts as the threshold falls, for one `Matching`."""
+
+    score: Floats  # (S,) at which something changes, the highest first
+    row: Integers  # (E,) of the score of each change
+    frame: Integers  # (E,)
+    added: Floats  # (4, E) true positives, false positives, ground truths that an ignored detection takes, similarity
+    truths: Integers  # (F,) number of ground truths of each frame
+    first_score: Floats  # (T,) the devkit's first pass: the scores of the true positives, the highest first
+    first_frame: Integers  # (T,)
 
 
 @dataclass(frozen=True)
@@ -134,7 +151,10 @@ def find_candidates(labels: Sequence[Labels], predictions: Sequence[Labels]) -> 
     shared = shared * np.maximum(np.minimum(bottom_a, bottom_b) - np.maximum(top_a, top_b), 0)
     volume = area_a * a[:, 5] + area_b * b[:, 5] - shared
     pairs["3d"] = Pairs(frame, truth, detection, shared / np.where(volume > 0, volume, 1))
-    return Candidates(truths, detections, detections.score, pairs, dontcare)
+    truth_frame, detection_frame = (
+        np.repeat(np.arange(len(labels)), np.diff(starts)) for starts in (truth_starts, detection_starts)
+    )
+    return Candidates(truths, detections, detections.score, truth_frame, detection_frame, len(labels), pairs, dontcare)
 
 
 def outside(labels: Labels, level: Level) -> Mask:
@@ -173,35 +193,49 @@ def clean_data(
     return Matching(pairs, select_truths(labels, name, level), ignored, countable)
 
 
-def count(matching: Matching, candidates: Candidates) -> Counts:
-    """The devkit's second pass, at every score a detection has."""
+def find_changes(matching: Matching, candidates: Candidates) -> Changes:
+    """Matches every frame: once in the devkit's first pass, and in its second at every score a detection has.
+
+    In the first pass nothing is dropped; each ground truth in turn takes the best-scored of the detections left, the
+    first of them where scores are equal.
+    """
     pairs, score = matching.pairs, candidates.score
     alphas = candidates.truths.alpha, candidates.detections.alpha
     masks = matching.truths, matching.ignored, matching.countable
     changes = _changes(pairs.frame, pairs.truth, pairs.detection, pairs.overlap, score, *masks, *alphas)
-    lone = score[matching.countable]  # a false positive, until a change says that it is taken
-    scores, rows = np.unique(np.concatenate((changes[:, 0], lone)), return_inverse=True)
-
-    def running(values: Floats, rows: Integers) -> Floats:
-        return np.bincount(rows, values, minlength=len(scores))[::-1].cumsum()
-
-    true_positives, undecided, taken, similarity = (running(column, rows[: len(changes)]) for column in changes.T[1:])
-    return Counts(
-        score=scores[::-1],
-        true_positives=true_positives,
-        false_positives=running(np.ones(len(lone)), rows[len(changes) :]) - taken,
-        misses=matching.truths.sum() - true_positives - undecided,
-        similarity=similarity,
+    frame, at, *matched = changes.T
+    lone = np.flatnonzero(matching.countable)  # a false positive, until a change says that it is taken
+    added = np.zeros((4, len(changes) + len(lone)))
+    added[:, : len(changes)] = matched
+    added[1, len(changes) :] = 1
+    scores, row = np.unique(-np.concatenate((at, score[lone])), return_inverse=True)
+    first = _found_detections(pairs.truth, pairs.detection, score, matching.truths, matching.ignored)
+    first = first[np.argsort(-score[first], kind="stable")]
+    return Changes(
+        score=-scores,
+        row=row,
+        frame=np.concatenate((frame.astype(np.int64), candidates.detection_frame[lone])),
+        added=added,
+        truths=np.bincount(candidates.truth_frame[matching.truths], minlength=candidates.frames),
+        first_score=score[first],
+        first_frame=candidates.detection_frame[first],
     )
 
 
-def found_scores(matching: Matching, candidates: Candidates) -> Floats:
-    """The devkit's first pass: the scores (T,) of the true positives, highest first, when nothing is dropped.
+def count(changes: Changes, draws: Integers | None = None) -> Counts:
+    """The counts at every score, in which each frame counts as often as it is drawn (F,): once by default."""
+    added = changes.added if draws is None else changes.added * draws[changes.frame]
+    size = len(changes.score)
+    true_positives, false_positives, undecided, similarity = (
+        np.bincount(changes.row, values, minlength=size).cumsum() for values in added
+    )
+    total = changes.truths.sum() if draws is None else changes.truths @ draws
+    return Counts(changes.score, true_positives, false_positives, total - true_positives - undecided, similarity)
 
-    Each ground truth in turn takes the best-scored of the detections left; the first of them where scores are equal.
-    """
-    pairs, score = matching.pairs, candidates.score
-    return np.sort(_found_scores(pairs.truth, pairs.detection, score, matching.truths, matching.ignored))[::-1]
+
+def found_scores(changes: Changes, draws: Integers | None = None) -> Floats:
+    """The scores (T,) of the first pass, the highest first, each as often as its frame is drawn (F,)."""
+    return changes.first_score if draws is None else np.repeat(changes.first_score, draws[changes.first_frame])
 
 
 def match_at(matching: Matching, candidates: Candidates, threshold: float) -> tuple[Integers, Mask]:
@@ -248,10 +282,10 @@ def _meeting(bounds_a: Floats, starts_a: Integers, bounds_b: Floats, starts_b: I
 
 
 @njit(cache=True, nogil=True)
-def _found_scores(truth: Integers, detection: Integers, score: Floats, truths: Mask, ignored: Mask) -> Floats:
-    """The loop of `found_scores`: (T,), unsorted."""
+def _found_detections(truth: Integers, detection: Integers, score: Floats, truths: Mask, ignored: Mask) -> Integers:
+    """The true positives (T,) of the devkit's first pass, in the order of their ground truths."""
     taken = np.zeros(len(score), np.bool_)
-    found = np.empty(len(truth))
+    found = np.empty(len(truth), np.int64)
     size = k = 0
     while k < len(truth):
         row, best = truth[k], -1
@@ -263,7 +297,7 @@ def _found_scores(truth: Integers, detection: Integers, score: Floats, truths: M
         if best >= 0:
             taken[best] = True
             if truths[row] and not ignored[best]:
-                found[size] = score[best]
+                found[size] = best
                 size += 1
     return found[:size]
 
@@ -316,12 +350,12 @@ def _changes(
     truth_alpha: Floats,
     detection_alpha: Floats,
 ) -> Floats:
-    """The changes in the counts as the threshold passes each score of a frame: (E, 5) float64.
+    """The changes in the counts as the threshold passes each score of a frame: (E, 6) float64.
 
-    The score, and the differences in true positives, in ground truths matched with an ignored detection, in countable
-    detections that are taken, and in similarity.
+    The frame and the score, and the differences in true positives, in false positives (less by the countable detections
+    that are taken), in ground truths matched with an ignored detection, and in similarity.
     """
-    changes = np.empty((len(truth), 5))
+    changes = np.empty((len(truth), 6))
     matched = np.full(len(truths), -1)
     taken = np.zeros(len(score), np.bool_)
     size = begin = 0
@@ -329,25 +363,26 @@ def _changes(
         end = begin
         while end < len(truth) and frame[end] == frame[begin]:
             end += 1
-        before = np.zeros(5)
+        before = np.zeros(4)
         for threshold in np.unique(score[detection[begin:end]])[::-1]:
             taken[detection[begin:end]] = False
             _assign(truth, detection, overlap, score, ignored, begin, end, threshold, matched, taken)
-            now = np.zeros(5)
+            now = np.zeros(4)
             for k in range(begin, end):
                 row = truth[k]
                 d = matched[row]
                 if d < 0 or (k > begin and truth[k - 1] == row):
                     continue
                 if countable[d]:
-                    now[3] += 1
+                    now[1] -= 1
                 if truths[row] and ignored[d]:
                     now[2] += 1
                 elif truths[row]:
-                    now[1] += 1
-                    now[4] += (1 + np.cos(truth_alpha[row] - detection_alpha[d])) / 2
-            changes[size] = now - before
-            changes[size, 0] = threshold
+                    now[0] += 1
+                    now[3] += (1 + np.cos(truth_alpha[row] - detection_alpha[d])) / 2
+            changes[size, 0] = frame[begin]
+            changes[size, 1] = threshold
+            changes[size, 2:] = now - before
             before = now
             size += 1
         begin = end

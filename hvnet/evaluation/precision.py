@@ -5,22 +5,27 @@ with 11 recall positions. `exact` is the area under the interpolated precision-r
 devkit takes at most one score a ground truth, so with n <= 40 of them no detector gets past (n - 1) / 40 in its R40.
 """
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
+from numba import njit
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from hvnet.boxes import indices_in_boxes
 from hvnet.data.frame import Camera
 from hvnet.data.kitti import boxes_to_lidar
 from hvnet.data.labels import DONTCARE, Labels
+from hvnet.evaluation.bootstrap import Resampling, interval
 from hvnet.evaluation.matching import (
     LEVELS,
     LEVELS_WITHOUT_2D,
     Candidates,
+    Changes,
     Counts,
     Floats,
     Integers,
@@ -30,6 +35,7 @@ from hvnet.evaluation.matching import (
     clean_data,
     count,
     find_candidates,
+    find_changes,
     found_scores,
     match_at,
     outside,
@@ -53,6 +59,7 @@ def evaluate(
     levels: Sequence[Level] | None = None,
     score_threshold: float | None = None,
     points: Sequence[Integers] | None = None,
+    resampling: Resampling | None = None,
 ) -> dict[str, dict[str, Any]]:
     """Scores the predictions for frames against their labels; one `Labels` a frame in both.
 
@@ -66,6 +73,10 @@ def evaluate(
     (`rule_for`). `levels` are by default KITTI's, without their least height in the image where no label has a 2D box.
     `points` are for every frame the numbers of points in the boxes of its labels (K,), see `count_points`; without them
     the report's recall by points is None.
+
+    `resampling` (see `bootstrap.resample`) adds `bootstrap`: the number of `resamples` and of `groups`; by level, how
+    many `groups_with_ground_truths` there are and how many `resamples_without`; and `intervals`, laid out as the
+    figures, each the two ends. It adds `resampled`, the figures (N,) themselves, by strictness.
     """
     if len(labels) != len(predictions):
         raise ValueError(f"predictions: want one for each of the {len(labels)} labels, got {len(predictions)}")
@@ -73,6 +84,8 @@ def evaluate(
         raise ValueError("labels: want at least one frame, got none")
     if points is not None and [len(frame) for frame in points] != [len(frame) for frame in labels]:
         raise ValueError("points: want one number for every row of every frame's labels, DontCare too")
+    if resampling is not None and len(resampling.group) != len(labels):
+        raise ValueError(f"resampling: want {len(labels)} frames, as there are labels, got {len(resampling.group)}")
     candidates = find_candidates(labels, predictions)
     notes = []
     if levels is None:
@@ -88,7 +101,7 @@ def evaluate(
         if rule.neighbour in classes:
             notes_of_class = [f"{rule.neighbour} is scored itself, so that a {name} found there is wrong"]
             rule = rule._replace(neighbour=None)
-        result[name] = _evaluate_class(candidates, name, rule, levels, score_threshold, all_points)
+        result[name] = _evaluate_class(candidates, name, rule, levels, score_threshold, all_points, resampling)
         result[name]["counts"]["frames"] = len(labels)
         if result[name]["counts"]["detections"]:
             result[name]["warnings"] = notes + notes_of_class + result[name]["warnings"]
@@ -120,30 +133,33 @@ def _evaluate_class(
     levels: Sequence[Level],
     score_threshold: float | None,
     points: Integers | None,
+    resampling: Resampling | None,
 ) -> dict[str, Any]:
     truths = candidates.truths.select(candidates.truths.name == name)
     detections = candidates.detections.select(candidates.detections.name == name)
     metrics = [metric for metric in METRICS if _has(truths, metric) and _has(detections, metric)]
     oriented = not (_unknown_angles(truths) or _unknown_angles(detections))
+    draws = [None, *(resampling.draws if resampling else ())]  # first every frame once
     tables: dict[str, Any] = {}
+    resampled: dict[str, Any] = {}
     curves: dict[str, dict[str, list[Counts]]] = {}
     for strictness, overlaps in (("strict", rule.strict), ("loose", rule.loose)):
         table: dict[str, dict[str, list[float | None]]] = {measure: {} for measure in MEASURES}
+        drawn: dict[str, dict[str, list[Floats]]] = {measure: {} for measure in MEASURES}
         curves[strictness] = {metric: [] for metric in metrics}
         for metric in metrics:
+            keys = ("2d", "aos") if metric == "2d" and oriented else (metric,)
             for level in levels:
                 matching = clean_data(candidates, name, metric, overlaps[metric], level, rule.neighbour)
-                counts = count(matching, candidates)
-                samples = _samples(matching, counts, found_scores(matching, candidates))
-                quality = {metric: counts.precision}
-                if metric == "2d" and oriented:
-                    quality["aos"] = counts.orientation
-                for key, values in quality.items():
-                    for measure, average in _averages(counts.recall, values, samples).items():
-                        found = average if matching.truths.any() else None
-                        table[measure].setdefault(key, []).append(found)
-                curves[strictness][metric].append(_thin(counts))
-        tables[strictness] = table
+                changes = find_changes(matching, candidates)
+                curves[strictness][metric].append(_thin(count(changes)))
+                bar = tqdm(draws, f"{name} {metric}, resampling", disable=None if resampling else True, leave=False)
+                figures = np.array([_averages(changes, each) for each in bar])
+                for (k, key), (m, measure) in itertools.product(enumerate(keys), enumerate(MEASURES)):
+                    found = float(figures[0, k, m]) if matching.truths.any() else None
+                    table[measure].setdefault(key, []).append(found)
+                    drawn[measure].setdefault(key, []).append(figures[1:, k, m])
+        tables[strictness], resampled[strictness] = table, drawn
     truth_counts = [int(select_truths(candidates.truths, name, level).sum()) for level in levels]
     report = None
     if metrics:
@@ -154,6 +170,14 @@ def _evaluate_class(
         threshold = _best_score(curves["strict"][metric]) if score_threshold is None else score_threshold
         report = {"metric": metric, "overlap": overlap, "score_threshold": threshold, "chosen_by": chosen_by}
         report |= _report(candidates, matchings, threshold, points)
+    warnings = _warnings(name, truths, detections, levels, truth_counts)
+    uncertain = {}
+    if resampling is not None:
+        bootstrap = _bootstrap(candidates, name, levels, resampling)
+        bootstrap["intervals"] = {**_intervals(resampled["strict"]), "loose": _intervals(resampled["loose"])}
+        uncertain = {"bootstrap": bootstrap, "resampled": resampled}
+        if len(detections):
+            warnings += _interval_warnings(bootstrap, levels)
     return {
         **tables["strict"],
         "loose": tables["loose"],
@@ -161,8 +185,41 @@ def _evaluate_class(
         "levels": [level.name for level in levels],
         "counts": {"ground_truths": truth_counts, "detections": len(detections)},
         "report": report,
-        "warnings": _warnings(name, truths, detections, levels, truth_counts),
+        "warnings": warnings,
         "curves": curves,
+        **uncertain,
+    }
+
+
+def _bootstrap(candidates: Candidates, name: str, levels: Sequence[Level], resampling: Resampling) -> dict[str, Any]:
+    """What was drawn, and how much of it has objects of a class."""
+    with_truths, without = [], []
+    for level in levels:
+        frames = candidates.truth_frame[select_truths(candidates.truths, name, level)]
+        with_truths.append(len(np.unique(resampling.group[frames])))
+        without.append(int((resampling.draws[:, np.unique(frames)].sum(axis=1) == 0).sum()))
+    whole = {"resamples": len(resampling.draws), "groups": resampling.groups}
+    return whole | {"groups_with_ground_truths": with_truths, "resamples_without": without}
+
+
+def _interval_warnings(bootstrap: dict[str, Any], levels: Sequence[Level]) -> list[str]:
+    """Why intervals are not what they seem, with the levels that each reason holds for."""
+    found: dict[str, list[str]] = {}
+    columns = (bootstrap["groups_with_ground_truths"], bootstrap["resamples_without"])
+    for level, groups, without in zip(levels, *columns, strict=True):
+        if groups == 1:
+            text = "all ground truths are in one group of frames: the intervals know nothing of others"
+            found.setdefault(text, []).append(level.name)
+        if groups and without:
+            text = f"{without} of {bootstrap['resamples']} resamples hold no ground truth: the intervals leave them out"
+            found.setdefault(text, []).append(level.name)
+    return [f"{', '.join(names)}: {text}" for text, names in found.items()]
+
+
+def _intervals(resampled: dict[str, dict[str, list[Floats]]]) -> dict[str, dict[str, list[list[float] | None]]]:
+    return {
+        measure: {key: [interval(values) for values in levels] for key, levels in table.items()}
+        for measure, table in resampled.items()
     }
 
 
@@ -182,20 +239,22 @@ def _unknown_angles(labels: Labels) -> int:
     return int((labels.alpha == -10).sum())
 
 
-def _samples(matching: Matching, counts: Counts, scores: Floats) -> Integers:
-    """Rows of the counts (at most 41,) at the devkit's thresholds.
+@njit(cache=True, nogil=True)
+def _thresholds(scores: Floats, total: int) -> Floats:
+    """The devkit's thresholds (at most 41,) of the true positives' scores (T,), highest first.
 
-    Of the true positives' scores, highest first, those whose recall is nearest to 0, 1/40, 2/40, ...
+    They are those whose recall is nearest to 0, 1/40, 2/40, ...; total: the number of ground truths.
     """
-    total = matching.truths.sum()
-    chosen, target = [], 0.0
+    chosen = np.empty(len(scores))
+    size, target = 0, 0.0
     for k, score in enumerate(scores):
         last = k == len(scores) - 1
         recall, following = (k + 1) / total, (k + 2) / total
         if last or following - target >= target - recall:
-            chosen.append(score)
+            chosen[size] = score
+            size += 1
             target += 1 / RECALL_STEPS
-    return np.searchsorted(-counts.score, -np.array(chosen))
+    return chosen[:size]
 
 
 def best_to_the_right(values: Floats) -> Floats:
@@ -203,14 +262,25 @@ def best_to_the_right(values: Floats) -> Floats:
     return np.maximum.accumulate(values[::-1])[::-1]
 
 
-def _averages(recall: Floats, values: Floats, samples: Integers) -> dict[str, float]:
-    """Averages over recall, in per cent, of precision or orientation (S,): sampled as the devkit does, and exact."""
-    sampled = np.zeros(RECALL_STEPS + 1)
-    sampled[: len(samples)] = best_to_the_right(values[samples])
+def _averages(changes: Changes, draws: Integers | None = None) -> Floats:
+    """Averages over recall of precision and orientation (2, 3), in per cent: R40, R11 and exact, as in MEASURES.
+
+    draws: how often each frame is drawn (F,), once by default. NaN where no ground truth is drawn.
+    """
+    total = int(changes.truths.sum() if draws is None else changes.truths @ draws)
+    if not total:
+        return np.full((2, len(MEASURES)), math.nan)
+    counts = count(changes, draws)
+    rows = np.searchsorted(-counts.score, -_thresholds(found_scores(changes, draws), total))
+    recall = counts.recall
     order = np.argsort(recall, kind="stable")
-    area = np.diff(recall[order], prepend=0) @ best_to_the_right(values[order])
-    averages = {"R40": sampled[1:].mean(), "R11": sampled[::4].mean(), "exact": area}
-    return {measure: 100 * float(average) for measure, average in averages.items()}
+    steps = np.diff(recall[order], prepend=0)
+    averages = []
+    for values in (counts.precision, counts.orientation):
+        sampled = np.zeros(RECALL_STEPS + 1)
+        sampled[: len(rows)] = best_to_the_right(values[rows])
+        averages.append((sampled[1:].mean(), sampled[::4].mean(), steps @ best_to_the_right(values[order])))
+    return 100 * np.array(averages)
 
 
 def _thin(counts: Counts) -> Counts:

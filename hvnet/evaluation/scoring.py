@@ -14,6 +14,7 @@ from hvnet.data.frame import Frame, Frames, check_names, frame_at, notes
 from hvnet.data.kitti import centres_to_lidar, detections_to_labels, frame_labels
 from hvnet.data.labels import DONTCARE, Labels, count_others
 from hvnet.data.sensor import Look
+from hvnet.evaluation.bootstrap import Resampling
 from hvnet.evaluation.precision import evaluate
 from hvnet.evaluation.rules import Rule, config_rules
 from hvnet.exceptions import InputError
@@ -65,6 +66,7 @@ def score(
     frames: Frames,
     *,
     rules: Mapping[str, Rule] | None = None,
+    resampling: Resampling | None = None,
     in_range: bool = False,
     visit: Callable[[Detected], None] | None = None,
     seen: set[str] | None = None,
@@ -73,6 +75,7 @@ def score(
 ) -> dict[str, dict[str, Any]]:
     """Detects in labelled frames and scores the boxes as `evaluate` does, by the rules of the detector's config.
 
+    resampling: adds intervals to the figures, see `evaluate`.
     in_range: labels whose centre is outside the detector's range do not count.
     visit: called for every frame of this rank, in their order.
     background: say how many labels have a class that the detector does not know.
@@ -94,7 +97,8 @@ def score(
     if background and ranks.rank() == 0:
         names = (str(name) for truth in truths for name in truth.name)
         print_once([background_note(names, detector.classes)], set() if seen is None else seen)
-    return evaluate(truths, found, classes=detector.classes, rules=rules or config_rules(detector.config))
+    rules = rules or config_rules(detector.config)
+    return evaluate(truths, found, classes=detector.classes, rules=rules, resampling=resampling)
 
 
 def labels_in_range(frame: Frame, config: Config) -> Labels:

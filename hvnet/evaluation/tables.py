@@ -8,13 +8,20 @@ from typing import Any
 
 import numpy as np
 
+from hvnet.evaluation.bootstrap import CONFIDENCE
 from hvnet.evaluation.matching import Counts
 from hvnet.evaluation.precision import MEASURES, best_to_the_right
 from hvnet.evaluation.rules import METRICS
 
+INTERVAL_WIDTH = 22
+"""Columns of a figure with its interval."""
+
 
 def format_table(result: dict[str, dict[str, Any]]) -> str:
-    """The result of `evaluate` as text, at most 100 columns wide with four levels or fewer."""
+    """The result of `evaluate` as text, at most 100 columns wide with four levels or fewer.
+
+    Of a bootstrap every figure has its interval beside it.
+    """
     lines = []
     for name, scored in result.items():
         counts, levels = scored["counts"], scored["levels"]
@@ -24,14 +31,14 @@ def format_table(result: dict[str, dict[str, Any]]) -> str:
             lines[-1] = f"{name}: no detections; ground truths: {totals}"
             lines += _warning_lines(scored["warnings"])
             continue
-        lines.append("")
-        side_by_side = [MEASURES] if len(levels) <= 3 else [(measure,) for measure in MEASURES]
+        bootstrap = scored.get("bootstrap")
+        lines += [*_bootstrap_lines(bootstrap, counts["frames"]), ""] if bootstrap else [""]
+        width = INTERVAL_WIDTH if bootstrap else 9
+        side_by_side = [MEASURES] if len(levels) <= 3 and not bootstrap else [(measure,) for measure in MEASURES]
         for measures in side_by_side:
-            width = 9 * len(levels)
-            lines.append(f"{'':10}" + "  ".join(f"{measure:>{width}}" for measure in measures))
-            lines.append(f"{'overlap':10}" + "  ".join([_cells(levels)] * len(measures)))
-            lines += _rows(scored["overlaps"], scored, "strict", measures)
-            lines += [*_rows(scored["overlaps"], scored["loose"], "loose", measures), ""]
+            lines.append(f"{'':10}" + "  ".join(f"{measure:>{width * len(levels)}}" for measure in measures))
+            lines.append(f"{'overlap':10}" + "  ".join([_cells(levels, width)] * len(measures)))
+            lines += [*_rows(scored, "strict", measures), *_rows(scored, "loose", measures), ""]
         lines += _warning_lines(scored["warnings"]) + [""] * bool(scored["warnings"])
         lines += [*_report_lines(scored["report"], levels), ""]
     return "\n".join(lines).rstrip()
@@ -41,17 +48,63 @@ def _warning_lines(warnings: Sequence[str]) -> list[str]:
     return [line for warning in warnings for line in textwrap.wrap(f"! {warning}", 100, subsequent_indent="  ")]
 
 
-def _rows(
-    overlaps: dict[str, dict[str, float]], table: dict[str, Any], strictness: str, measures: Sequence[str]
-) -> list[str]:
+def _bootstrap_lines(bootstrap: dict[str, Any], frames: int) -> list[str]:
+    kind = "frames" if bootstrap["groups"] == frames else "groups of frames"
+    drawn = f"{bootstrap['resamples']} resamples of {bootstrap['groups']} {kind}"
+    holding = ", ".join(map(str, bootstrap["groups_with_ground_truths"]))
+    return textwrap.wrap(f"[low, high]: {CONFIDENCE} % of {drawn}; {holding} of them hold ground truths", 100)
+
+
+def _rows(scored: dict[str, Any], strictness: str, measures: Sequence[str]) -> list[str]:
+    """The lines of a class at strict or loose overlaps, with intervals where there are any."""
     rows = []
-    for key in table["R40"]:
-        metric = "2d" if key == "aos" else key
-        overlap, loose = overlaps[strictness][metric], overlaps["loose"][metric]
-        if strictness == "strict" or loose != overlaps["strict"][metric]:
-            cells = "  ".join(_cells([_figure(value) for value in table[measure][key]]) for measure in measures)
-            rows.append(f"{key:4}{overlap:<6.2f}{cells}")
+    table, ends = scored, scored["bootstrap"]["intervals"] if "bootstrap" in scored else None
+    if strictness == "loose":
+        table, ends = table["loose"], ends and ends["loose"]
+    for key in _keys(table["R40"], scored["overlaps"], strictness):
+        parts = []
+        for measure in measures:
+            figures = [_figure(value) for value in table[measure][key]]
+            if ends is None:
+                parts.append(_cells(figures))
+            else:
+                shown = map(_with_interval, figures, ends[measure][key])
+                parts.append(_cells(shown, INTERVAL_WIDTH))
+        rows.append(_row_title(key, scored["overlaps"][strictness]) + "  ".join(parts))
     return rows
+
+
+def _keys(table: Iterable[str], overlaps: dict[str, dict[str, float]], strictness: str) -> list[str]:
+    """The metrics of a table; of loose overlaps those that differ from the strict."""
+    differ = {metric for metric, overlap in overlaps["loose"].items() if overlap != overlaps["strict"][metric]}
+    return [key for key in table if strictness == "strict" or _metric(key) in differ]
+
+
+def _metric(key: str) -> str:
+    return "2d" if key == "aos" else key
+
+
+def _row_title(key: str, overlaps: dict[str, float]) -> str:
+    return f"{key:4}{overlaps[_metric(key)]:<6.2f}"
+
+
+def _with_interval(figure: str, ends: Sequence[float] | None) -> str:
+    return figure if ends is None else f"{figure} [{ends[0]:.1f}, {ends[1]:.1f}]"
+
+
+def format_differences(
+    result: dict[str, dict[str, Any]], differences: dict[str, dict[str, dict[str, list[list[float] | None]]]]
+) -> str:
+    """What `differences` finds of a result and another, as text."""
+    lines = []
+    for name, found in differences.items():
+        scored = result[name]
+        lines.append(f"{name:10}{_cells(scored['levels'], INTERVAL_WIDTH)}")
+        for strictness, table in found.items():
+            for key in _keys(table, scored["overlaps"], strictness):
+                cells = ["-" if each is None else _with_interval(f"{each[0]:+.2f}", each[1:]) for each in table[key]]
+                lines.append(_row_title(key, scored["overlaps"][strictness]) + _cells(cells, INTERVAL_WIDTH))
+    return "\n".join(lines)
 
 
 def _report_lines(report: dict[str, Any] | None, levels: Sequence[str]) -> list[str]:
