@@ -84,13 +84,14 @@ def place(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         train.main([*given, "--out", str(folder / "runs" / run), "--device", "cpu", *SETTINGS, *once])
     labels = folder / "KITTI" / "training" / "label_2"
     ids = read_split(scenes, "train") + read_split(scenes, "val")
-    for name in ("results", "label_2", "labels", "point_gnn_car", "detections/results", "val/results"):
+    for name in ("results", "label_2", "labels", "point_gnn_car", "detections/results", "val/results", "other/results"):
         (folder / name).mkdir(parents=True)
         for at in ids:
             lines = (labels / f"{at}.txt").read_text().splitlines()
             scored = name.endswith(("results", "car"))
             kept = [f"{line} 0.9" if scored else line for line in lines if not scored or "DontCare" not in line]
             (folder / name / f"{at}.txt").write_text("".join(f"{line}\n" for line in kept))
+    (folder / "KITTI" / "drives.csv").write_text("frame,drive\n" + "".join(f"{at},{int(at) % 2}\n" for at in ids))
     (folder / "val.txt").write_text("".join(f"{at}\n" for at in ids[-2:]))
     return folder
 
