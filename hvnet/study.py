@@ -31,6 +31,12 @@ def main(arguments: Sequence[str] | None) -> None:
     parser.add_argument(
         "--validate", type=Path, metavar="DIR", help="a KITTI root whose validation frames score every row, too"
     )
+    parser.add_argument(
+        "--groups",
+        type=Path,
+        metavar="FILE",
+        help="for the intervals of --validate draw the frames of a drive together; a CSV file: columns frame and drive",
+    )
     parser.add_argument("--out", type=Path, default=Path("runs/studies"), metavar="DIR", help="(default: runs/studies)")
     add_device(parser)
     parser.add_argument("--budget", metavar="epochs=N|steps=N", help="length of every training (default: the config's)")
@@ -62,6 +68,7 @@ def main(arguments: Sequence[str] | None) -> None:
         options.rows or (),
         options.base,
         options.set,
+        options.groups,
     )
     with locked(options.out):
         run_study(options.name, how)

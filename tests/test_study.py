@@ -58,6 +58,9 @@ def test_a_study_is_written_and_goes_on(
     assert re.search(r"\| 8 points a voxel \|.*\d\* \|", table)  # is not fused
     assert re.search(r"All 2 seeds agree on the order of [01] of 1 pairs of rows", table)
     assert re.search(r"Real: 2 frames, which hold \d+ moderate objects of Car", table)
+    figures = r"( \+?-?\d+\.\d \[-?\d+\.\d, -?\d+\.\d\] \|| - \|){4}"
+    assert re.search(rf"^\| real \| Car \|.*\n.*\n\| every point \|{figures}$", table, flags=re.MULTILINE)
+    assert re.search(rf"^\| real: less the.*\n.*\n\| 8 points a voxel \|{figures}$", table, flags=re.MULTILINE)
     with (tmp_path / "density.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [(row["row"], row["seed"], row["steps"]) for row in rows] == [
@@ -120,6 +123,7 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
         (["loss", "--set", "head.iou"], "--set head.iou: want KEY=VALUE"),
         (["loss", "--data", "nowhere"], r"nowhere/ImageSets/train\.txt"),
         (["loss", "--validate", "nowhere"], r"nowhere/ImageSets/val\.txt"),
+        (["loss", "--groups", "drives.csv"], r"--groups drives\.csv: is for --validate; add it"),
         (["loss", "--base", str(CONFIGS / "hvnet.yaml")], r"hvnet\.yaml: has no key synthetic"),
         (["speed", "--budget", "steps=1"], "--budget: is not for speed"),
     ],

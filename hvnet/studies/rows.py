@@ -10,12 +10,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
 from hvnet.config import Config, config_to_dict
 from hvnet.data.frame import Frames
 from hvnet.data.kitti import KittiFrames
 from hvnet.data.labels import no_results
+from hvnet.evaluation.bootstrap import resample
 from hvnet.evaluation.precision import evaluate
 from hvnet.evaluation.scoring import labels_in_range, score
 from hvnet.exceptions import InputError, Stopped
@@ -30,7 +32,17 @@ from hvnet.training.run import Run
 
 MEASURES = ("bev", "3d", "aos")
 
+REAL_RESAMPLES = 1000
+
 Scores = dict[str, dict[str, list[float | None]]]  # class, measure, levels: AP in %
+Samples = dict[str, dict[str, list[float]]]  # class, bev or 3d, resamples: moderate AP in %, NaN without ground truths
+
+
+class RealFrames(NamedTuple):
+    """The frames of --validate."""
+
+    frames: KittiFrames
+    groups: Sequence[str]  # of every frame, drawn together for the intervals: a drive, or the frame's own name
 
 
 class Outcome(NamedTuple):
@@ -45,8 +57,9 @@ class Outcome(NamedTuple):
     device: str
     dropped: float  # share of the points in range that no voxel has a place for, in the validation frames
     scores: Scores
-    real_dropped: float | None = None  # both on the frames of --validate
+    real_dropped: float | None = None  # these three on the frames of --validate
     real: Scores | None = None
+    real_samples: Samples | None = None
 
     def mean_ap(self, level: int = 1) -> float:
         """BEV mAP in % of easy, moderate or hard objects, over the classes that the frames hold."""
@@ -94,13 +107,28 @@ def dropped_share(config: Config, frames: Frames) -> float:
 
 def score_in_range(detector: Detector, frames: Frames) -> Scores:
     """Exact BEV and 3D AP and AOS on labelled frames; objects outside of the detector's range do not count."""
-    result = score(detector, frames, in_range=True, background=False)
+    return _exact(score(detector, frames, in_range=True, background=False))
+
+
+def _exact(result: dict[str, dict[str, Any]]) -> Scores:
     none: list[float | None] = [None] * 3  # of a measure that the labels do not allow
     return {name: {m: table["exact"].get(m, none) for m in MEASURES} for name, table in result.items()}
 
 
+def score_real(detector: Detector, real: RealFrames) -> tuple[Scores, Samples]:
+    """As `score_in_range`, and the BEV and 3D AP of resamples, which are the same ones for every detector."""
+    resampling = resample(REAL_RESAMPLES, real.groups)
+    result = score(detector, real.frames, in_range=True, background=False, resampling=resampling)
+    none = [None, np.full(REAL_RESAMPLES, np.nan)]
+    samples = {
+        name: {m: table["resampled"]["strict"]["exact"].get(m, none)[1].round(2).tolist() for m in ("bev", "3d")}
+        for name, table in result.items()
+    }
+    return _exact(result), samples
+
+
 def run_row(
-    row: Row, config: Config, data: Data, real: KittiFrames | None, folder: Path, device: torch.device
+    row: Row, config: Config, data: Data, real: RealFrames | None, folder: Path, device: torch.device
 ) -> Outcome:
     """Trains and scores a row in a folder, or takes up what of it there is. Raises Stopped if a signal comes."""
     checkpoint, file = folder / "checkpoint.pt", folder / "result.json"
@@ -124,12 +152,15 @@ def run_row(
             "scores": score_in_range(load(checkpoint, str(device)), data.val),
         }
         write_result(file, known)
-    if real is not None and (known.get("real_root") != str(real.root) or "real_dropped" not in known):
-        known |= {"real_root": str(real.root), "real_dropped": dropped_share(config, real)}
-        known |= {"real": score_in_range(load(checkpoint, str(device)), real)}
-        write_result(file, known)
+    of_real = {}
+    if real is not None:
+        scored = {"real_root": str(real.frames.root), "real_groups": list(real.groups)}
+        if "real_samples" not in known or any(known.get(key) != value for key, value in scored.items()):
+            known |= {**scored, "real_dropped": dropped_share(config, real.frames)}
+            known["real"], known["real_samples"] = score_real(load(checkpoint, str(device)), real)
+            write_result(file, known)
+        of_real = {key: known[key] for key in ("real_dropped", "real", "real_samples")}
     found = {key: known[key] for key in ("steps", "seconds", "parameters", "dropped", "scores")}
-    of_real = {key: known[key] for key in ("real_dropped", "real")} if real is not None else {}
     where = known.get("device", describe(device))
     return Outcome(row, config.train.seed, checkpoint, device=where, **found, **of_real)
 

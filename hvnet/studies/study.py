@@ -14,19 +14,31 @@ from torch import Tensor
 
 from hvnet.config import Config, SyntheticConfig, load_config
 from hvnet.data.frame import object_names
-from hvnet.data.kitti import KittiFrames, read_split_frames
+from hvnet.data.kitti import read_split_frames
+from hvnet.evaluation.bootstrap import read_groups
 from hvnet.evaluation.rules import config_rules
 from hvnet.evaluation.scoring import background_note
 from hvnet.exceptions import InputError, Stopped
 from hvnet.network.detector import Detector, load
 from hvnet.network.model import HVNet
 from hvnet.studies.catalogue import STUDIES
-from hvnet.studies.rows import Outcome, count_objects, describe, read_result, row_folder, run_row, with_budget
+from hvnet.studies.rows import (
+    Outcome,
+    RealFrames,
+    count_objects,
+    describe,
+    read_result,
+    row_folder,
+    run_row,
+    with_budget,
+)
 from hvnet.studies.tables import (
+    REAL_LEGEND,
     UNFUSED,
     agreement_legend,
     draw_speed,
     draw_trained,
+    real_table,
     short_table,
     shown,
     speed_legend,
@@ -53,6 +65,7 @@ class Options:
     rows: Sequence[str] = ()  # those to train; of the others what is done is shown; empty: all
     base: Path | None = None  # config under the rows
     changes: Sequence[str] = ()  # overrides of every row
+    groups: Path | None = None  # the drives of the frames of `validate`: a CSV file
 
 
 def list_studies() -> str:
@@ -124,7 +137,7 @@ def read_data(name: str, config: Config, options: Options) -> StudyData:
 
 
 def run_rows(
-    name: str, configs: dict[str, Config], data: StudyData, real: KittiFrames | None, options: Options
+    name: str, configs: dict[str, Config], data: StudyData, real: RealFrames | None, options: Options
 ) -> list[Outcome]:
     """Trains the rows that are wanted, seed after seed; of the others it takes what there is already."""
     root = data.frames.root
@@ -162,11 +175,11 @@ def time_rows(configs: dict[str, Config], data: StudyData, device: torch.device)
 
 
 def train_rows(
-    name: str, configs: dict[str, Config], data: StudyData, real: KittiFrames | None, options: Options
+    name: str, configs: dict[str, Config], data: StudyData, real: RealFrames | None, options: Options
 ) -> tuple[list[Outcome], dict[str, Times], list[str]]:
     """Every other study: its rows, their times, and the text."""
     first = next(iter(configs.values()))
-    every = [data.frames.train, data.frames.val, *([real] if real else [])]
+    every = [data.frames.train, data.frames.val, *([real.frames] if real else [])]
     names = [each for frames in every for k in range(len(frames)) for each in object_names(frames, k) or ()]
     if note := background_note(names, [entry.name for entry in first.head.classes]):
         print(note)
@@ -190,9 +203,13 @@ def train_rows(
         f"Time: of a cloud on {describe(options.device)}; the first row is 1." + UNFUSED * (fused < set(detectors)),
     ]
     if real:
-        name = first.head.classes[0].name
-        count = count_objects(first, real, name)
-        lines += ["", f"Real: {len(real)} frames, which hold {count} moderate objects of {name} in range."]
+        lines += ["", *real_table(STUDIES[name], outcomes)]
+        if len(times) > 1:
+            lines += ["", *real_table(STUDIES[name], outcomes, less_first=True)]
+        first_class = first.head.classes[0].name
+        count = count_objects(first, real.frames, first_class)
+        held = f"{len(real.frames)} frames, which hold {count} moderate objects of {first_class} in range"
+        lines += ["", f"Real: {held}. {REAL_LEGEND}"]
     if options.seeds > 1 and len(times) > 1:
         lines += ["", agreement_legend(outcomes, options.seeds)]
     return outcomes, times, lines
@@ -205,6 +222,8 @@ def run_study(name: str, options: Options) -> None:
     if unknown:
         known = ", ".join(row.name for row in study.rows)
         raise InputError(f"--rows {unknown[0]}: no row of {name}; there are {known}")
+    if options.groups and not options.validate:
+        raise InputError(f"--groups {options.groups}: is for --validate; add it")
     for option in ("base", "budget", "validate"):
         if name == "speed" and getattr(options, option) is not None:
             raise InputError(f"--{option}: is not for speed, which trains nothing and rests on configs/hvnet.yaml")
@@ -214,7 +233,10 @@ def run_study(name: str, options: Options) -> None:
     if options.budget:
         with_budget(first, options.budget, 1)  # a mistake in it is said before the scenes are made
     data = read_data(name, first, options)
-    real = read_split_frames(options.validate, first.train.val_split, first.data) if options.validate else None
+    real = None
+    if options.validate:
+        frames = read_split_frames(options.validate, first.train.val_split, first.data)
+        real = RealFrames(frames, read_groups(options.groups, frames.names) if options.groups else frames.names)
     outcomes: list[Outcome] = []
     if name == "speed":
         times, lines = time_rows({row: configs[row] for row in options.rows or configs}, data, device)
@@ -223,7 +245,11 @@ def run_study(name: str, options: Options) -> None:
         outcomes, times, lines = train_rows(name, configs, data, real, options)
         draw_trained(options.out / f"{name}.png", name, outcomes, times)
     where: dict[str, object] = {"data": data.name, "train frames": len(data.frames.train)}
-    where |= {"val frames": len(data.frames.val), "real frames": len(real or ()), "timed on": describe(device)}
+    where |= {
+        "val frames": len(data.frames.val),
+        "real frames": len(real.frames) if real else 0,
+        "timed on": describe(device),
+    }
     write_csv(options.out / f"{name}.csv", name, outcomes, times, where)
     text = [f"# {name}: {study.shows}", "", f"In the paper: {study.source}.", "", *lines]
     (options.out / f"{name}.md").write_text("\n".join(text) + "\n", encoding="utf-8")
