@@ -32,8 +32,8 @@ from hvnet.data.scenes.files import make_frame
 from hvnet.data.scenes.street import Options
 from hvnet.exceptions import InputError
 from hvnet.network import fused
-from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint
-from hvnet.network.detector import SHIPPED, Detector
+from hvnet.network.checkpoint import find_checkpoint, load_checkpoint, model_from_checkpoint
+from hvnet.network.detector import Detector
 from hvnet.network.model import HVNet
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
@@ -45,7 +45,8 @@ STAGES = ("read", "encode", "backbone", "heads", "decode", "NMS")
 def make_model(name: str) -> HVNet:
     """The shipped model, or an untrained one of a config."""
     if name == "compact":
-        return model_from_checkpoint(load_checkpoint(SHIPPED), str(SHIPPED))
+        path = find_checkpoint(name)
+        return model_from_checkpoint(load_checkpoint(path), str(path))
     torch.manual_seed(0)
     config = load_config(CONFIGS / f"{name}.yaml")
     return HVNet(dataclasses.replace(config, head=dataclasses.replace(config.head, score_threshold=0.0))).eval()

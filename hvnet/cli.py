@@ -142,9 +142,12 @@ def add_device(parser: argparse.ArgumentParser) -> None:
 
 
 def add_checkpoint(parser: argparse.ArgumentParser) -> None:
-    """The option --checkpoint."""
-    parser.add_argument(
-        "--checkpoint", type=Path, metavar="FILE", help="from hvnet.train (default: the weights of the package)"
+    """The options --checkpoint and --weights, of which one may be given: `options.checkpoint` is what `hvnet.load`
+    takes, a path, a name or None."""
+    either = parser.add_mutually_exclusive_group()
+    either.add_argument("--checkpoint", type=Path, metavar="FILE", help="from hvnet.train (default: --weights compact)")
+    either.add_argument(
+        "--weights", dest="checkpoint", metavar="NAME", help="weights of the package, see docs/model_card.md"
     )
 
 

@@ -191,6 +191,7 @@ def main(arguments: Sequence[str] | None) -> None:
             "cloud.bin",
             "nuscenes/ --all-round --turn -90",
             "cloud.pcd --checkpoint runs/demo/checkpoint.pt",
+            "clouds/ --weights compact",
             "clouds/ --pictures 0",
             "/data/kitti --split val --out val",
             "/data/kitti --split val --out val --bootstrap 1000 --groups drives.csv",

@@ -8,8 +8,7 @@ from pathlib import Path
 from hvnet.cli import add_checkpoint, make_parser, run_command
 from hvnet.exceptions import InputError
 from hvnet.folders import check_empty
-from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint
-from hvnet.network.detector import SHIPPED
+from hvnet.network.checkpoint import find_checkpoint, load_checkpoint, model_from_checkpoint
 from hvnet.network.export import describe, is_program, write_onnx, write_program
 
 
@@ -38,7 +37,7 @@ def main(arguments: Sequence[str] | None) -> None:
         raise InputError("the package onnx is missing, without which torch writes no ONNX file: pip install onnx")
     check_empty(options.out)
 
-    path = options.checkpoint or SHIPPED
+    path = find_checkpoint(options.checkpoint)
     model = model_from_checkpoint(load_checkpoint(path), str(path))
     try:
         options.out.mkdir(parents=True, exist_ok=True)

@@ -28,6 +28,7 @@ from hvnet.data.sources import find_frames
 from hvnet.evaluation.scoring import detect_frames, look_at
 from hvnet.exceptions import InputError
 from hvnet.folders import check_empty
+from hvnet.network.checkpoint import find_checkpoint
 from hvnet.network.detector import Detector, load
 from hvnet.network.model import Detections
 from hvnet.pictures.clouds import FORMATS, Colour, Subject, draw_bev, draw_frame
@@ -80,12 +81,13 @@ def main(arguments: Sequence[str] | None) -> None:
     if options.features and (clash := set(frames.names) & {f"{name}-features" for name in frames.names}):
         name = min(clash)
         raise InputError(f"{name}: has the name of the features of {name.removesuffix('-features')}; rename one")
-    models = [(detector, options.checkpoint.stem if options.checkpoint else "shipped weights")]
+    models = [(detector, find_checkpoint(options.checkpoint).stem)]
     if options.compare:
         models.append((load(options.compare, options.device, **read_mount(options)), options.compare.stem))
         if models[0][1] == models[1][1]:  # runs/a/checkpoint.pt and runs/b/checkpoint.pt
             models = [
-                (each, str(path)) for (each, _), path in zip(models, (options.checkpoint, options.compare), strict=True)
+                (each, str(find_checkpoint(path)))
+                for (each, _), path in zip(models, (options.checkpoint, options.compare), strict=True)
             ]
     bar = tqdm(range(len(frames)), desc="drawing", unit="cloud", dynamic_ncols=True)
     looks, reflectances = [], []

@@ -31,14 +31,16 @@ from hvnet.training.folder import find_run
 DEMO_FRAMES = 4
 
 
-def choose_data(given: Path | None, root: Path | None, checkpoint: Path | None) -> tuple[Path | None, Path | None]:
-    """The clouds, None for generated scenes, and the checkpoint, None for the package's, of the given input.
+def choose_data(
+    given: Path | None, root: Path | None, checkpoint: Path | str | None
+) -> tuple[Path | None, Path | str | None]:
+    """The clouds, None for generated scenes, and the checkpoint, None for the package's default, of the given input.
 
     Raises InputError for options that exclude each other.
     """
     if given is not None and (given / "checkpoint.pt").is_file():
         if checkpoint is not None:
-            raise InputError(f"--checkpoint: the run {given} has its own; leave one of them out")
+            raise InputError(f"--checkpoint, --weights: the run {given} has its own weights; leave one of them out")
         return root or find_run(given).root, given / "checkpoint.pt"
     if root is not None:
         raise InputError("--data: only for the folder of a run, which holds checkpoint.pt; give the root as INPUT")

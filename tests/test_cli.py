@@ -10,7 +10,7 @@ import pytest
 
 import hvnet
 from hvnet.__main__ import COMMANDS
-from hvnet.cli import read_overlaps, run_command
+from hvnet.cli import add_checkpoint, make_parser, read_overlaps, run_command
 from hvnet.exceptions import InputError, Stopped
 from tests.helpers import ROOT
 from tests.test_layout import modules
@@ -84,6 +84,17 @@ def test_how_a_command_ends(capsys: pytest.CaptureFixture[str]) -> None:
     assert ends(Stopped("stopped in epoch 1", 15)) == (143, "stopped in epoch 1\n", "")
     assert ends(Stopped("", 2)) == (130, "", "")  # not the first of several ranks
     assert ends(KeyboardInterrupt()) == (130, "", "interrupted\n")
+
+
+def test_weights_or_a_checkpoint(capsys: pytest.CaptureFixture[str]) -> None:
+    parser = make_parser("detect", "", [])
+    add_checkpoint(parser)
+    for given, wanted in {"": None, "--weights compact": "compact", "--checkpoint a/b.pt": Path("a/b.pt")}.items():
+        assert parser.parse_args(given.split()).checkpoint == wanted
+    with pytest.raises(SystemExit) as caught:
+        parser.parse_args(["--checkpoint", "a.pt", "--weights", "compact"])
+    assert caught.value.code == 2
+    assert capsys.readouterr().err.endswith("error: argument --weights: not allowed with argument --checkpoint\n")
 
 
 @pytest.mark.parametrize("given", ["Truck", "Truck=", "Truck=nan", "Truck=0", "Truck=1.1", "=0.5", "Lorry=0.5"])

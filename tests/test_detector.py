@@ -19,10 +19,9 @@ from hvnet.exceptions import InputError
 from hvnet.kernels import launch
 from hvnet.kernels.rotated import rotated_iou_bev
 from hvnet.network.anchors import MAX_HEIGHT, MAX_SIZE
-from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint, save_checkpoint
+from hvnet.network.checkpoint import find_checkpoint, load_checkpoint, model_from_checkpoint, save_checkpoint
 from hvnet.network.detector import (
     MAX_GRAPHS,
-    SHIPPED,
     Detector,
     detections,
     fold_batch_norms,
@@ -581,7 +580,7 @@ def test_options_that_are_no_numbers(options: dict) -> None:
 
 @pytest.mark.parametrize("facts", [None, [1.0], {"ground": "x"}, {"ground": math.nan}, {"reflectance_scale": "255"}])
 def test_damaged_facts_on_the_sensor(facts: object, tmp_path: Path) -> None:
-    content = load_checkpoint(SHIPPED) | {"sensor": facts}
+    content = load_checkpoint(find_checkpoint(None)) | {"sensor": facts}
     save_checkpoint(tmp_path / "damaged.pt", content)
     with pytest.raises(InputError, match=r"damaged\.pt: its facts on the sensor are damaged"):
         load(tmp_path / "damaged.pt", "cpu")
@@ -589,7 +588,7 @@ def test_damaged_facts_on_the_sensor(facts: object, tmp_path: Path) -> None:
 
 def test_a_checkpoint_without_facts_on_the_sensor(tmp_path: Path, street: Tensor) -> None:
     """As version 0.1.0 wrote it: nothing is moved, and a height that would mean nothing is refused."""
-    content = load_checkpoint(SHIPPED)
+    content = load_checkpoint(find_checkpoint(None))
     del content["sensor"]
     save_checkpoint(tmp_path / "old.pt", content)
     assert load(tmp_path / "old.pt", "cpu").look(street + torch.tensor([0, 0, 1.33, 0])).shift == 0

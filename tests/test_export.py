@@ -19,8 +19,7 @@ from hvnet.data.kitti import read_frame
 from hvnet.exceptions import InputError
 from hvnet.export import main
 from hvnet.network.anchors import make_anchors
-from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint, save_checkpoint
-from hvnet.network.detector import SHIPPED
+from hvnet.network.checkpoint import find_checkpoint, load_checkpoint, model_from_checkpoint, save_checkpoint
 from hvnet.network.export import describe, map_names, maps_of_class, write_onnx, write_program
 from hvnet.network.head import HeadMaps
 from hvnet.network.model import Detections, HVNet
@@ -40,7 +39,7 @@ def scene(root: Path, count: int) -> tuple[Tensor, Tensor]:
 
 @pytest.fixture(scope="module")
 def shipped() -> HVNet:
-    return model_from_checkpoint(load_checkpoint(SHIPPED), str(SHIPPED))
+    return model_from_checkpoint(load_checkpoint(find_checkpoint(None)), "compact")
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.Mon
     ("arguments", "message"),
     [
         (["nothing.bin"], "nothing.bin: no such file"),
-        (["{run}", "--checkpoint", "a.pt"], "--checkpoint: the run .*run has its own"),
+        (["{run}", "--checkpoint", "a.pt"], "--checkpoint, --weights: the run .*run has its own"),
         (["{run}", "--data", "{empty}"], "checkpoint.pt: truncated"),
         (["{empty}", "--data", "{empty}"], "--data: only for the folder of a run"),
         (["--data", "{empty}"], "--data: only for the folder of a run"),

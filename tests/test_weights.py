@@ -10,19 +10,19 @@ from hvnet.config import config_from_dict, config_to_dict, load_config
 from hvnet.data.kitti import frame_labels, read_frame, read_split
 from hvnet.exceptions import InputError
 from hvnet.kernels.rotated import rotated_iou_bev
-from hvnet.network.checkpoint import load_checkpoint, save_checkpoint
-from hvnet.network.detector import SHIPPED
+from hvnet.network.checkpoint import WEIGHTS, load_checkpoint, save_checkpoint
 from hvnet.network.model import HVNet
 from hvnet.weights.__main__ import CONFIG, RECIPE, halve, main
 
 
 def test_the_shipped_weights() -> None:
-    assert SHIPPED.stat().st_size <= 10e6
-    content = load_checkpoint(SHIPPED)
+    shipped = WEIGHTS / "compact.pt"
+    assert shipped.stat().st_size <= 10e6
+    content = load_checkpoint(shipped)
     assert content.keys() == {"config", "model", "sensor"}
     assert content["sensor"] == {"ground": pytest.approx(-1.66, abs=0.05), "reflectance_scale": 1.0}
     recipe = load_config(CONFIG, RECIPE)
-    assert config_from_dict(content["config"], str(SHIPPED)) == recipe
+    assert config_from_dict(content["config"], str(shipped)) == recipe
     for name, value in content["model"].items():
         wanted = torch.int64 if name.endswith("tracked") else torch.float32 if "running" in name else torch.float16
         assert value.dtype == wanted, name

@@ -9,6 +9,10 @@ from hvnet.config import config_from_dict
 from hvnet.exceptions import InputError
 from hvnet.network.model import HVNet
 
+WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
+"""The folder of the weights that come with the package: NAME.pt; docs/model_card.md says what they are for."""
+DEFAULT = "compact"
+
 
 def save_checkpoint(path: Path, content: dict) -> None:
     """Writes a checkpoint atomically: whatever happens, there is the old file or the new one, never half of one.
@@ -27,6 +31,20 @@ def save_checkpoint(path: Path, content: dict) -> None:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         kept = "; what it held before is whole: make room and --resume" if path.is_file() else ""
         raise InputError(f"{path}: cannot be written ({reason}){kept}") from error
+
+
+def find_checkpoint(given: str | Path | None) -> Path:
+    """The file of a checkpoint: a path, or the name of weights of the package; None: the default ones.
+
+    Where there is a file of that name, the path counts. Raises InputError naming the weights that there are.
+    """
+    path = Path(DEFAULT if given is None else given)
+    if given is not None and (path.is_file() or path.suffix or path.name != str(given)):
+        return path
+    names = sorted(file.stem for file in WEIGHTS.glob("*.pt"))
+    if path.name not in names:
+        raise InputError(f"{path}: no weights of this name; there are {', '.join(names)}; or give a checkpoint file")
+    return WEIGHTS / f"{path}.pt"
 
 
 def load_checkpoint(path: str | Path) -> dict:

@@ -37,15 +37,12 @@ from hvnet.kernels.place import ground_heights, place_points
 from hvnet.kernels.rotated import nms_order, rotated_nms
 from hvnet.network.anchors import anchors_per_cell, decode
 from hvnet.network.backbone import ConvReLU
-from hvnet.network.checkpoint import load_checkpoint, model_from_checkpoint
+from hvnet.network.checkpoint import find_checkpoint, load_checkpoint, model_from_checkpoint
 from hvnet.network.devices import select_device
 from hvnet.network.fused import inference, is_fused
 from hvnet.network.head import LOCATION_VALUES, Head, regress, scores_of, weight_of
 from hvnet.network.model import Detections, HVNet
 from hvnet.network.static import COLUMNS, BoxSteps, Rows, StaticFrame, capacity_of
-
-SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "compact.pt"
-"""The weights that come with the package: see docs/model_card.md."""
 
 MAX_GRAPHS = 4
 """CUDA graphs that a detector keeps: each holds the memory of all that it calculates."""
@@ -446,12 +443,13 @@ def load(
     turn: float = 0.0,
     all_round: bool = False,
 ) -> Detector:
-    """A detector from a checkpoint of `python -m hvnet.train`, by default from the weights that come with the package.
+    """A detector from a checkpoint of `python -m hvnet.train`, or from weights that come with the package.
 
+    checkpoint: a file, or the name of weights, such as "compact", which is the default.
     device: auto (CUDA where there is a GPU), cpu, cuda or cuda:N. sensor_height, turn, all_round: see `Detector`.
     Raises InputError naming the file, or the device.
     """
-    path = SHIPPED if checkpoint is None else checkpoint
+    path = find_checkpoint(checkpoint)
     content = load_checkpoint(path)
     facts = content.get("sensor", {"ground": None, "reflectance_scale": None})
     if not isinstance(facts, dict) or not all(
