@@ -18,7 +18,7 @@ COMMANDS = {
     "study": "rerun the paper's tables and figures",
     "data.synthetic": "generate street scenes in KITTI's layout",
     "data.database": "cut the labelled objects out of a KITTI split",
-    "weights": "retrain the weights of the package",
+    "weights": "make the weights of the package anew",
 }
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import hvnet
+from hvnet.config import load_config
 from tests.helpers import ROOT
 
 USE = """
@@ -69,7 +70,10 @@ def test_what_is_packed(tmp_path: Path) -> None:
     assert set(tracked) - packed - links == {".gitignore"}
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
+        archive.extractall(tmp_path / "installed")
     wanted = {name for name in tracked if name.startswith("hvnet/") and name not in links}
     wanted |= {f"hvnet/{name}" for name in tracked if name.startswith(("kernels/", "configs/"))}
     assert {name for name in names if ".dist-info/" not in name} == wanted
     assert {Path(name).name for name in names if "licenses/" in name} == {"LICENSE", "LICENSE.md"}
+    for recipe in (source / "hvnet" / "weights").glob("*.yaml"):  # whose base is in another folder
+        assert load_config(tmp_path / "installed" / "hvnet" / "weights" / recipe.name) == load_config(recipe)

@@ -1,43 +1,46 @@
-"""Retrains the weights of the package: `python -m hvnet.weights --data KITTI_ROOT`.
+"""Makes weights of the package anew: `python -m hvnet.weights --data KITTI_ROOT [--name NAME]`.
 
-It trains configs/compact.yaml by the recipe below and writes the result in half precision. The root is the part of
-KITTI that docs/model_card.md names: 23 whole frames, and the objects of all 3712 training frames in gt_database.npz.
+It trains by the recipe NAME.yaml of this folder and writes the result in half precision. The root is the part of KITTI
+that docs/model_card.md names, with the objects of all 3712 training frames in gt_database.npz.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+import warp as wp
 
+from hvnet import __version__, ranks
 from hvnet.cli import add_device, make_parser, run_command
 from hvnet.config import load_config
 from hvnet.data.gt_database import FILE_NAME
 from hvnet.exceptions import InputError
-from hvnet.network.checkpoint import load_checkpoint, save_checkpoint
-from hvnet.network.devices import select_device
+from hvnet.network.checkpoint import DEFAULT, load_checkpoint, save_checkpoint
+from hvnet.network.devices import device_name, select_device
 from hvnet.network.model import HVNet
 from hvnet.training.batches import kitti_data
 from hvnet.training.folder import check_folder, check_room
 from hvnet.training.run import Run
 
-CONFIG = Path(__file__).resolve().parents[1] / "configs" / "compact.yaml"
-RECIPE = (
-    "train.epochs=32",
-    "train.repeat=20",
-    "train.batch_size=2",
-    "train.learning_rate=3.0e-3",
-    "train.warmup_steps=200",
-    "train.cosine=true",
-    "train.bfloat16=true",
-    "train.validate_every=4",
-    "augment.mix=0.5",
-    "augment.whole_frames=0.2",
-)
-"""Changes to the config; docs/training.md gives the reasons."""
+RECIPES = Path(__file__).resolve().parent
 
 
-def halve(checkpoint: Path, out: Path) -> None:
-    """Writes config and weights of a checkpoint, the parameters in half precision.
+def describe(run: Run) -> dict[str, str | int]:
+    """What the bits of a run depend on besides its config and its data, and a little of these."""
+    return {
+        "hvnet": __version__,
+        "torch": str(torch.__version__),
+        "warp-lang": wp.__version__,
+        "processor": device_name(run.device),
+        "processes": ranks.size(),
+        "threads": torch.get_num_threads(),
+        "seed": run.config.train.seed,
+        "frames": len(run.data.train),
+    }
+
+
+def halve(checkpoint: Path, out: Path, made_by: dict[str, str | int]) -> None:
+    """Writes config and weights of a checkpoint, the parameters in half precision, and what made them.
 
     Running statistics stay in float32: the variances of the encoder's output overflow float16.
     """
@@ -47,34 +50,45 @@ def halve(checkpoint: Path, out: Path) -> None:
         name: value if name.endswith(running) else value.to(torch.float16) for name, value in content["model"].items()
     }
     facts = {"sensor": content["sensor"]} if "sensor" in content else {}
-    save_checkpoint(out, {"config": content["config"], "model": model} | facts)
+    save_checkpoint(out, {"config": content["config"], "model": model, "made_by": made_by} | facts)
 
 
 def main(arguments: Sequence[str] | None) -> None:
     """The command."""
     parser = make_parser(
         "weights",
-        "Retrains the weights of the package: trains configs/compact.yaml by a fixed recipe and writes the "
-        "result in half precision. The root is the part of KITTI that docs/model_card.md names: 23 whole frames, and "
-        "the objects of all 3712 training frames in gt_database.npz.",
-        ["--data /data/kitti", "--data /data/kitti --resume"],
+        "Makes weights of the package anew: trains by a recipe and writes the result in half precision. The root is "
+        "the part of KITTI that docs/model_card.md names, with the objects of all 3712 training frames in "
+        "gt_database.npz. For two processes that train together, replace python with torchrun --nproc-per-node 2.",
+        ["--data /data/kitti", "--data /data/kitti --name standard", "--data /data/kitti --resume"],
     )
+    names = sorted(path.stem for path in RECIPES.glob("*.yaml"))
     parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="a KITTI root with gt_database.npz")
-    parser.add_argument("--run", type=Path, default=Path("runs/weights"), metavar="DIR", help="(default: runs/weights)")
-    parser.add_argument("--out", type=Path, default=Path("compact.pt"), metavar="FILE", help="(default: compact.pt)")
+    parser.add_argument(
+        "--name", choices=names, default=DEFAULT, help=f"the recipe: {', '.join(names)} (default: {DEFAULT})"
+    )
+    parser.add_argument("--run", type=Path, metavar="DIR", help="folder of the run (default: runs/weights/NAME)")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="(default: NAME.pt)")
     parser.add_argument("--resume", action="store_true", help="continue a run that was stopped")
     add_device(parser)
     options = parser.parse_args(arguments)
     if not (options.data / FILE_NAME).is_file():
         raise InputError(f"{options.data / FILE_NAME}: no such file; other objects would make other weights")
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    config = load_config(CONFIG, RECIPE)
-    check_folder(options.run, options.resume)
-    check_room(options.run, HVNet(config))
-    data = kitti_data(options.data, config)
-    Run(config, data, options.run, select_device(options.device), resume=options.resume).train()
-    halve(options.run / "checkpoint.pt", options.out)
-    print(f"weights:    {options.out} ({options.out.stat().st_size / 1e6:.2f} MB)")
+    folder = options.run or Path("runs") / "weights" / options.name
+    out = options.out or Path(f"{options.name}.pt")
+    config = load_config(RECIPES / f"{options.name}.yaml")
+    device = ranks.start(select_device(options.device))
+    if ranks.rank() == 0:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        check_folder(folder, options.resume)
+        check_room(folder, HVNet(config))
+    ranks.broadcast(None)  # nothing is written before the folder was looked at
+    run = Run(config, kitti_data(options.data, config), folder, device, resume=options.resume)
+    run.train()
+    if ranks.rank() == 0:
+        halve(run.checkpoint, out, describe(run))
+        print(f"weights:    {out} ({out.stat().st_size / 1e6:.2f} MB)")
+    ranks.stop()  # not after an error, as in hvnet.train
 
 
 if __name__ == "__main__":
