@@ -18,13 +18,10 @@ from hvnet.data.augment import (
     random_scaling,
     random_translation,
 )
-from hvnet.data.ground import ground_points
 from hvnet.data.gt_database import read_database
 from hvnet.data.insert import sample_objects, sampler_of
 from hvnet.data.kitti import read_frame
 from tests.objects import CLASSES, COUNTS, car, make_objects, no_boxes, points_of, scene, seeded
-
-NO_GROUND = torch.zeros(0, 3)
 
 
 def test_flip() -> None:
@@ -101,7 +98,7 @@ def test_points_stay_in_their_boxes(seed: int) -> None:
     assert before.sum() > 300
     options = AugmentConfig(flip=1.0)
     labels = torch.zeros(len(boxes), dtype=torch.int64)
-    moved, moved_boxes, moved_labels = augment(points, boxes, labels, NO_GROUND, None, options, seeded(seed), CLASSES)
+    moved, moved_boxes, moved_labels = augment(points, boxes, labels, None, options, seeded(seed), CLASSES)
     assert not torch.allclose(moved[:, :3], points[:, :3], atol=0.1)
     assert torch.equal(moved[:, 3], points[:, 3])
     assert torch.equal(moved_labels, labels)
@@ -117,14 +114,14 @@ def test_augment_repeats_with_its_seed() -> None:
     database = make_objects([("Car", car(x, 60.0)) for x in range(0, 60, 6)])
     options = AugmentConfig(objects={"Car": 15})
     first, again, other = (
-        augment(points, boxes, labels, NO_GROUND, database, options, seeded(seed), CLASSES) for seed in (7, 7, 8)
+        augment(points, boxes, labels, database, options, seeded(seed), CLASSES) for seed in (7, 7, 8)
     )
     assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
     assert not torch.equal(first[0], other[0])
 
 
 def test_augment_of_nothing() -> None:
-    points, boxes, labels = augment(torch.zeros(0, 4), *no_boxes(), NO_GROUND, None, AugmentConfig(), seeded(), CLASSES)
+    points, boxes, labels = augment(torch.zeros(0, 4), *no_boxes(), None, AugmentConfig(), seeded(), CLASSES)
     assert points.shape == (0, 4)
     assert boxes.shape == (0, 7)
     assert labels.shape == (0,)
@@ -139,8 +136,8 @@ def test_mixed_sectors_meet_at_a_border() -> None:
     boxes, labels = torch.tensor(around), torch.tensor([0, 1, -1])
     outcomes = set()
     for seed in range(20):
-        others = (other_ring, boxes.clone(), labels + 20, other_ring[:, :3] + torch.tensor([0, 0, 1.0]))
-        points, kept, of_kept, ground = mix_sectors(ring, boxes, labels, ring[:, :3], others, seeded(seed))
+        others = (other_ring, boxes.clone(), labels + 20)
+        points, kept, of_kept = mix_sectors(ring, boxes, labels, others, seeded(seed))
         own = of_kept < 10
         assert len(kept) == 3  # the two frames have boxes at the same three places
         outcomes.add(tuple(sorted(of_kept.tolist())))
@@ -151,16 +148,14 @@ def test_mixed_sectors_meet_at_a_border() -> None:
         order = torch.atan2(points[:, 1], points[:, 0]).argsort()
         assert (points[order, 3].diff() != 0).sum() <= 3
         assert len(points[:, :3].unique(dim=0)) == len(points)
-        assert len(ground) == 600  # of either frame on its side
-        assert 0 < ground[:, 2].sum() < 600
     assert len(outcomes) > 2
 
 
 def test_mixing_with_an_empty_frame_leaves_a_side() -> None:
     points, boxes = scene()
     labels = torch.zeros(len(boxes), dtype=torch.int64)
-    nothing = (torch.zeros(0, 4), *no_boxes(), torch.zeros(0, 3))
-    left, left_boxes, _, _ = mix_sectors(points, boxes, labels, torch.zeros(0, 3), nothing, seeded(1))
+    nothing = (torch.zeros(0, 4), *no_boxes())
+    left, left_boxes, _ = mix_sectors(points, boxes, labels, nothing, seeded(1))
     assert 0 < len(left) < len(points)
     assert 0 < len(left_boxes) < len(boxes)
     inside = points_in_boxes(points, left_boxes).any(1)
@@ -177,10 +172,8 @@ def test_many_threads_keep_rows_of_nan(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def augmented(seed: int) -> tuple[Tensor, Tensor, Tensor]:
         generator, labels = seeded(seed), torch.arange(12) % 3
-        ground = [ground_points(scene(each)[0]) for each in (seed, seed + 50)]
-        others = (*scene(seed + 50), labels, ground[1])
-        mixed = mix_sectors(*scene(seed), labels, ground[0], others, generator)
-        return augment(*mixed, objects, options, generator, CLASSES)
+        mixed = mix_sectors(*scene(seed), labels, (*scene(seed + 50), labels), generator)
+        return augment(*mixed, objects, options, generator, CLASSES, None if seed % 2 else -1.6)
 
     one = [augmented(seed) for seed in range(8)]
     monkeypatch.setattr("hvnet.kernels.launch.force_many_threads", True)

@@ -1,4 +1,4 @@
-"""The ground of a frame: slopes, steps, walls, and the labelled boxes of real frames, which stand on it."""
+"""The ground under a cloud: slopes, steps, walls, and the labelled boxes of real frames, which stand on it."""
 
 import math
 from pathlib import Path
@@ -7,11 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from hvnet.boxes import points_in_boxes
-from hvnet.data.ground import CELL, ground_points, ground_under
+from hvnet.data.ground import CELL, FEWEST, FEWEST_CELLS, cells_of, flatten, ground_map, heights_at, reach_of, solve
 from hvnet.data.kitti import read_frame, read_split
 
-PLACES = torch.tensor([[5.0, 0.0], [20.0, -6.0], [40.0, 10.0]])
+REACH = 64.0
+PLACES = torch.tensor([[[5.0, 0.0], [20.0, -6.0], [40.0, 10.0]]])
 
 
 def grid(x: tuple[float, float], y: tuple[float, float], step: float = 0.5) -> Tensor:
@@ -25,25 +25,36 @@ def surface(height: Tensor, places: Tensor, seed: int = 0) -> Tensor:
     return torch.cat((places, (height + noise)[:, None]), dim=1)
 
 
-@pytest.mark.parametrize("base", [-1.7, 0.0, 3.0])
-def test_a_slope_under_a_wall_and_a_roof(base: float) -> None:
-    """Two degrees up and one to the side; a wall, a row of cars and a roof above are not taken for ground."""
+def street(base: float = -1.7) -> tuple[Tensor, Tensor]:
+    """Points (N, 3) of a slope, two degrees up and one to the side, with a wall and a roof, and its heights at PLACES.
+
+    The roof hides the ground in a row of cells.
+    """
     places = grid((0.0, 60.0), (-20.0, 20.0))
     slope = base + 0.035 * places[:, 0] - 0.017 * places[:, 1]
     wall = torch.cat((grid((0.0, 60.0), (15.0, 15.5)), torch.linspace(base, base + 4, 120)[:, None]), dim=1)
-    roofs = grid((10.0, 30.0), (-8.0, -6.0))
-    roofs = torch.cat((roofs, torch.full((len(roofs), 1), base + 1.5)), dim=1)
-    ground = ground_points(torch.cat((surface(slope, places), wall, roofs)))
-    want = base + 0.035 * PLACES[:, 0] - 0.017 * PLACES[:, 1]
-    assert (ground_under(ground, PLACES) - want).abs().max() < 0.05
+    hidden = (places[:, 0] > 10) & (places[:, 0] < 30) & (places[:, 1] > -10) & (places[:, 1] < -8)
+    points = surface(torch.where(hidden, slope + 1.5, slope), places)
+    return torch.cat((points, wall)), base + 0.035 * PLACES[..., 0] - 0.017 * PLACES[..., 1]
+
+
+def ground_at(points: Tensor, places: Tensor) -> Tensor:
+    """Heights (P,) of the ground under points (N, 3) at places (P, 2)."""
+    return heights_at(ground_map(points[None], REACH), places[None])[0]
+
+
+@pytest.mark.parametrize("base", [-1.7, 0.0, 3.0])
+def test_a_slope_beside_a_wall_and_under_a_roof(base: float, threads: None) -> None:
+    points, want = street(base)
+    assert (ground_at(points, PLACES[0]) - want[0]).abs().max() < 0.06
 
 
 def test_a_pavement_beside_the_road() -> None:
     """A step of 0.15 m is followed but for what is near it."""
     places = grid((0.0, 60.0), (-20.0, 20.0))
-    ground = ground_points(surface(torch.where(places[:, 1] > 6, -1.55, -1.7), places))
-    found = ground_under(ground, torch.tensor([[20.0, -4.0], [20.0, 14.0]]))
-    torch.testing.assert_close(found, found.new_tensor([-1.7, -1.55]), atol=0.05, rtol=0)
+    points = surface(torch.where(places[:, 1] > 6, -1.55, -1.7), places)
+    found = ground_at(points, torch.tensor([[20.0, -4.0], [20.0, 14.0]]))
+    torch.testing.assert_close(found, torch.tensor([-1.7, -1.55]), atol=0.06, rtol=0)
 
 
 def test_reflections_below_the_ground_are_skipped() -> None:
@@ -51,35 +62,72 @@ def test_reflections_below_the_ground_are_skipped() -> None:
     places = grid((0.0, 40.0), (-10.0, 10.0), 0.25)
     points = surface(torch.full((len(places),), -1.7), places)
     points[::40, 2] -= 1
-    assert (ground_under(ground_points(points), PLACES) + 1.7).abs().max() < 0.08
+    assert (ground_at(points, PLACES[0]) + 1.7).abs().max() < 0.08
 
 
-@pytest.mark.parametrize("count", [0, 1, 5])
-def test_too_few_points_tell_nothing(count: int) -> None:
-    ground = ground_points(torch.rand(20 * count, 3) + CELL * torch.arange(count).repeat_interleave(20)[:, None])
-    assert len(ground) <= 4 * count
-    assert ground_under(ground[:5], PLACES).isnan().all()
-    assert ground_under(ground[:5], PLACES[:0]).shape == (0,)
+def test_clouds_of_a_batch_are_each_alone() -> None:
+    """Rows of NaN fill the shorter one up."""
+    long, short = street()[0], street(0.5)[0][:9000]
+    filled = torch.full_like(long, math.nan)
+    filled[: len(short)] = short
+    both = ground_map(torch.stack((long, filled)), REACH)
+    assert both.shape == (2, cells_of(REACH), cells_of(REACH))
+    torch.testing.assert_close(both, torch.cat([ground_map(each[None], REACH) for each in (long, short)]))
+
+
+@pytest.mark.parametrize("cells", [0, 1, FEWEST_CELLS - 1, FEWEST_CELLS])
+def test_too_few_cells_tell_nothing(cells: int) -> None:
+    places = CELL * torch.arange(cells).repeat_interleave(FEWEST)[:, None] + torch.tensor([0.5, 0.5])
+    points = torch.cat((places, torch.full((len(places), 1), -1.0)), dim=1)
+    assert ground_map(points[None], REACH).isnan().all() == (cells < FEWEST_CELLS)
+    assert heights_at(ground_map(points[None], REACH), PLACES[:, :0]).shape == (1, 0)
 
 
 def test_points_that_are_not_finite_are_ignored() -> None:
-    places = grid((0.0, 40.0), (-10.0, 10.0))
-    points = surface(torch.full((len(places),), -1.7), places)
+    points, _ = street()
     broken = points.clone()
     broken[::7, 0], broken[3::7, 2] = math.nan, math.inf
     whole = points[broken.isfinite().all(dim=1)]
-    assert torch.equal(ground_points(broken), ground_points(whole))
+    assert torch.equal(ground_map(broken[None], REACH), ground_map(whole[None], REACH))
+
+
+def test_places_beyond_the_map_have_the_height_of_its_border() -> None:
+    ground = torch.arange(16.0).view(1, 4, 4)
+    assert heights_at(ground, torch.tensor([[[-9.0, -9.0], [9.0, 9.0], [0.0, 0.0], [1.0, -3.0]]])).tolist() == [
+        [0, 15, 7.5, 8]
+    ]
+
+
+def test_systems_of_three() -> None:
+    half = torch.rand(5, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    matrix, values = half @ half.mT + torch.eye(3), torch.rand(5, 3, dtype=torch.float64)
+    torch.testing.assert_close(solve(matrix, values), torch.linalg.solve(matrix, values))
+
+
+def test_a_flattened_frame() -> None:
+    """Boxes move as the points around them; a frame without ground stays as it is."""
+    points, want = street()
+    points = torch.cat((points, torch.ones_like(points[:, :1])), dim=1)
+    boxes = torch.cat((PLACES[0], (want[0] + 0.8)[:, None], torch.tensor([[3.9, 1.6, 1.6, 0.3]] * 3)), dim=1)
+    limits = (0.0, -32.0, -3.0, 64.0, 32.0, 2.0)
+    assert reach_of(limits) == 64
+    flat, moved = flatten(points, boxes, -1.6, limits)
+    assert (moved[:, 2] - moved[:, 5] / 2 + 1.6).abs().max() < 0.06
+    assert torch.equal(moved[:, [0, 1, 3, 4, 5, 6]], boxes[:, [0, 1, 3, 4, 5, 6]])
+    assert torch.equal(flat[:, [0, 1, 3]], points[:, [0, 1, 3]])
+    assert -1.6 <= flat[:, 2].quantile(0.5) < -1.5  # the ground is a low point of a cell, along which it rises by 7 cm
+    for before, after in zip((points[:5], boxes), flatten(points[:5], boxes, -1.6, limits), strict=True):
+        assert torch.equal(before, after)
 
 
 def test_labelled_boxes_of_real_frames_stand_on_it(kitti_root: Path) -> None:
-    """Half of them within 6 cm, nine of ten within 20 cm; the points in the boxes are not looked at."""
+    """Half of them within 6 cm, nine of ten within 20 cm."""
     left = []
     for name in read_split(kitti_root, "val"):
         frame = read_frame(kitti_root, name)
         assert frame.objects is not None
         boxes = frame.objects.boxes
-        points = frame.points[~points_in_boxes(frame.points, boxes).any(dim=1)]
-        left.append((boxes[:, 2] - boxes[:, 5] / 2 - ground_under(ground_points(points), boxes[:, :2])).abs())
+        left.append((boxes[:, 2] - boxes[:, 5] / 2 - ground_at(frame.points, boxes[:, :2])).abs())
     every = torch.cat(left)
     assert len(every) > 150
     assert every.median() < 0.06
