@@ -307,7 +307,11 @@ class NoReads(TorchDispatchMode):
 
 @pytest.mark.usefixtures("many_threads")
 @pytest.mark.parametrize("height", ["found", 1.5, "none"])
-@pytest.mark.parametrize("changes", [{}, {"head.iou": "true", "head.direction": "true", "head.regression": "pose"}])
+@pytest.mark.parametrize("changes", [
+    {},
+    {"encoder.flat_ground": "true"},
+    {"head.iou": "true", "head.direction": "true", "head.regression": "pose"},
+])  # fmt: skip
 def test_a_frame_reads_nothing_from_the_device(changes: dict[str, str], height: Any) -> None:
     config = load_config(CONFIGS / "demo.yaml", [*NARROW, *(f"{key}={value}" for key, value in changes.items())])
     detector = Detector(lively(config, score_threshold=0.02), CPU, ground=-1.7, sensor_height=height, all_round=True)
@@ -318,7 +322,9 @@ def test_a_frame_reads_nothing_from_the_device(changes: dict[str, str], height: 
     with torch.no_grad(), mode:
         row = detector.numbers(*frame.split(frame.buffer), frame.sample)
     assert {"topk", "nms_groups", "baddbmm"} <= mode.seen
-    table = row[: -2 * len(clouds)].view(2 * len(detector.turns), 3, -1, 10)
+    size = (2 * len(detector.turns), 3, detector.steps.kept, 10)
+    table = row[: math.prod(size)].view(size)
+    assert len(row) - math.prod(size) == 2 * len(clouds) + 2 * 14**2 * detector.is_flat
     assert len(want[0].boxes) > 0
     assert sum(len(each.boxes) for each in detections(table)) >= sum(len(each.boxes) for each in want)
     with pytest.raises(AssertionError, match="a mask"), mode:
@@ -489,6 +495,53 @@ def test_clouds_at_different_heights_together(street: Tensor) -> None:
         detector = load(device="cpu", **options)  # type: ignore[arg-type]
         for found, cloud in zip(detector.batch(clouds), clouds, strict=True):
             same(found, detector(cloud), 1e-3)
+
+
+def on_ground(flat: bool = True, ground: float | None = -1.645, **options: Any) -> Detector:
+    """The shipped weights with clouds that are flattened, or as they are, however they were trained."""
+    model = model_from_checkpoint(load_checkpoint(find_checkpoint()), "shipped")
+    model.config = dataclasses.replace(
+        model.config, encoder=dataclasses.replace(model.config.encoder, flat_ground=flat)
+    )
+    return Detector(model, CPU, torch.float32, ground=ground, **options)
+
+
+def sloped(rows: Tensor) -> Tensor:
+    """Points or boxes on a road that rises by 3 % along x and falls by 2 % along y, from 0.2 m on."""
+    return torch.cat((rows[:, :2], rows[:, 2:3] + rows[:, :2] @ torch.tensor([[0.03], [-0.02]]) + 0.2, rows[:, 3:]), 1)
+
+
+@both_ways
+@pytest.mark.parametrize("options", [{}, {"all_round": True, "turn": 20.0}, {"sensor_height": 1.645}])
+def test_a_slope_is_taken_out_and_put_back(street: Tensor, options: dict[str, Any]) -> None:
+    want = on_ground(**options)(street)
+    agree(on_ground(**options)(sloped(street)), want._replace(boxes=sloped(want.boxes)))
+
+
+@both_ways
+@pytest.mark.parametrize("options", [{"ground": None}, {"sensor_height": "none"}])
+def test_a_slope_stays_where_no_ground_is_asked_for(street: Tensor, options: dict[str, Any]) -> None:
+    detector = on_ground(**options)
+    assert detector.place(sloped(street)).relief is None
+    for column, wanted in zip(detector(sloped(street)), on_ground(flat=False, **options)(sloped(street)), strict=True):
+        assert torch.equal(column, wanted)
+
+
+@both_ways
+def test_clouds_on_different_slopes_together(street: Tensor) -> None:
+    """As if each were alone; the last two have no ground."""
+    clouds = [street, sloped(street), street[:9000] + torch.tensor([0, 0, 2.0, 0]), street[:5], street[:0]]
+    for options in ({}, {"all_round": True}):
+        detector = on_ground(**options)
+        for found, cloud in zip(detector.batch(clouds), clouds, strict=True):
+            same(found, detector(cloud), 1e-3)
+
+
+def test_many_threads_flatten_as_one(street: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
+    clouds = [sloped(street), street[:12000]]
+    one, many = both(on_ground(), clouds, monkeypatch)
+    for found, want in zip(many, one, strict=True):
+        same(found, want, 1e-3)
 
 
 @pytest.mark.parametrize(("point_range", "turns"), [

@@ -48,7 +48,7 @@ def ground_map(points: Tensor, reach: float) -> Tensor:
     found = weight.sum(dim=1) >= FEWEST_CELLS
     # level where the cells lie on a line and say nothing across it
     level = torch.eye(3, dtype=torch.float64, device=points.device)
-    level[2, 2] = 1e-5
+    level[2, 2].fill_(1e-5)  # assigned, it would be a copy from the host
     known = heights.nan_to_num(0.0)
     for _ in range(ITERATIONS):
         weighed = rows.T * weight[:, None]  # (B, 3, S S)

@@ -56,18 +56,23 @@ class Placed(NamedTuple):
     """A cloud as the network sees it, once for every direction in which it looks."""
 
     clouds: list[Tensor]  # of every direction the points (N, 4), turned so that it is along x
-    shift: Tensor  # () metres by which they were raised
-    relief: Tensor | None  # (S, S) metres by which they were then lowered, see `ground_map`; None: by none
     ground: Tensor  # () height of the ground before that, NaN where none was found
+    shift: Tensor  # () metres by which they were raised
+    relief: Tensor | None  # (S, S) metres by which they were then lowered at the places of `ground_map`; None: by none
     bright: Tensor  # () a reflectance that is too large, 0 if none is
+
+    @property
+    def move(self) -> "Move":
+        """What was done to the cloud, on the host."""
+        return Move(float(self.bright), float(self.shift), None if self.relief is None else self.relief.cpu())
 
 
 class Move(NamedTuple):
-    """What was done to a cloud before detection, and what was seen of it."""
+    """What was done to a cloud before detection, so that its boxes can be taken back, and what was seen of it."""
 
     bright: float  # a reflectance that is too large, 0 if none is
     shift: float  # metres by which it was raised
-    relief: Tensor | None  # (S, S) metres by which it was then lowered, on the host
+    relief: Tensor | None  # (S, S) metres by which it was then lowered
 
 
 class Candidates(NamedTuple):
@@ -108,7 +113,7 @@ class Detector:
         if not _is_number(turn):
             raise ValueError(f"turn: want degrees, got {turn!r}")
         self.ground, self.reflectance, self.sensor_height = ground, reflectance, sensor_height
-        self.is_flat = model.config.encoder.flat_ground and ground is not None
+        self.is_flat = model.config.encoder.flat_ground and ground is not None and sensor_height != "none"
         self.reach = reach_of(model.config.encoder.point_range)
         turns = 1 if not all_round else turns_all_round(model.config.encoder.point_range)
         self.turns = [math.radians((turn + 360 * k / turns) % 360) for k in range(turns)]
@@ -168,7 +173,7 @@ class Detector:
         sample = torch.repeat_interleave(torch.arange(len(parts)), lengths).to(self.device)
         levels, scores = self.maps(points, sample, len(parts))
         found = self.suppress(self.candidates(levels, scores))
-        return found, [Move(float(each.bright), float(each.shift), each.relief) for each in placed]
+        return found, [each.move for each in placed]
 
     def batch_of_many(self, clouds: Sequence[Tensor | NDArray]) -> tuple[list[Detections], list[Move]]:
         """The same by many threads."""
@@ -245,7 +250,7 @@ class Detector:
             relief = relief[0]
         clouds = [turned(points, angle) for angle in self.turns]
         bright = torch.stack([too_bright(each, self.config.encoder.point_range) for each in clouds]).amax()
-        return Placed(clouds, shift, relief, ground, bright)
+        return Placed(clouds, ground, shift, relief, bright)
 
     def look(self, cloud: Tensor | NDArray) -> Look:
         """What the detector sees of a cloud (N, 4)."""

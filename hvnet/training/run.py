@@ -331,7 +331,7 @@ class Run:
     def validate(self) -> dict[str, dict[str, Any]]:
         """Detects in the validation frames, scores the boxes by KITTI's protocol and draws the first few frames."""
         ground = self.sensor["ground"] if self.config.encoder.flat_ground else None
-        detector = Detector(self.averaged or self.model, self.device, ground=ground, sensor_height="none")
+        detector = Detector(self.averaged or self.model, self.device, ground=ground)
         classes, point_range = detector.classes, self.config.encoder.point_range
 
         def draw(detected: Detected) -> None:
