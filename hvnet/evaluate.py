@@ -108,8 +108,8 @@ def main(argv: Sequence[str] | None) -> None:
             "--labels labels --predictions results --score 0.5 --classes Car",
             "--labels labels --predictions results --classes Truck --overlap Truck=0.5",
             "--labels labels --predictions results --classes Car bicycle=Cyclist",
-            "--labels labels --predictions results --bootstrap 1000 --groups drives.csv",
-            "--labels labels --predictions results --bootstrap 1000 --against other_results",
+            "--labels labels --predictions val --bootstrap 1000 --groups drives.csv",
+            "--labels labels --predictions val --bootstrap 1000 --against other",
         ],
     )
     parser.add_argument("--labels", type=Path, required=True, metavar="DIR", help="label files (KITTI's label_2)")
