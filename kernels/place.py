@@ -67,27 +67,27 @@ def ground_heights(points: Tensor, counts: Tensor) -> Tensor:
 
 
 def place_points(
-    points: Tensor, counts: Tensor, shift: Tensor, turns: Tensor, point_range: Sequence[float], reflectance: bool
+    points: Tensor, counts: Tensor, shift: Tensor, views: Tensor, point_range: Sequence[float], reflectance: bool
 ) -> tuple[Tensor, Tensor]:
-    """Clouds (B, N, 4) float32 as the network sees them in T directions: (B, T, N, 4), and the largest reflectance in
-    range if it is more than a tolerance above 1, else 0: (B,).
+    """Clouds (B, N, 4) float32 as the network sees them in V views: (B, V, N, 4), and the largest reflectance in range
+    if it is more than a tolerance above 1, else 0: (B,).
 
     counts: (B,) int32, the points of each cloud; the others become NaN
     shift: (B,) metres by which each is raised
-    turns: (T, 2) cosine and sine of the angles by which they are turned, counter-clockwise
+    views: (V, 3) cosine and sine of their turns, counter-clockwise, and -1 if y is mirrored after that, else 1
 
     A reflectance that is NaN or negative, or the same everywhere, is 0, as all are without `reflectance`.
     """
     _check_clouds(points, counts)
     check_tensor("shift", shift, (torch.float32,), (points.shape[0],), like=points)
-    check_tensor("turns", turns, (torch.float32,), (None, 2), like=points)
+    check_tensor("views", views, (torch.float32,), (None, 3), like=points)
     clouds, capacity = points.shape[:2]
-    placed = torch.empty(clouds, len(turns), capacity, 4, device=points.device)
+    placed = torch.empty(clouds, len(views), capacity, 4, device=points.device)
     extremes = torch.zeros(clouds, 3, dtype=torch.int32, device=points.device)
     threads = (clouds, min(capacity, STRIDE))
     launch(_find_extremes, threads, [_vectors(points), array(counts), array(extremes)], points.device)
     low, high = wp.vec3(*point_range[:3]), wp.vec3(*point_range[3:])
-    inputs = [_vectors(points), array(counts), array(shift), array(turns, 2), low, high, int(reflectance)]
+    inputs = [_vectors(points), array(counts), array(shift), array(views, 3), low, high, int(reflectance)]
     outputs = [array(extremes), array(placed, 4)]
     launch(_place, (clouds, capacity), [*inputs, *outputs], points.device)
     return placed, extremes[:, 2].view(torch.float32)
@@ -266,7 +266,7 @@ def _place(
     points: wp.array2d(dtype=wp.vec4),
     counts: wp.array(dtype=wp.int32),
     shift: wp.array(dtype=wp.float32),
-    turns: wp.array(dtype=wp.vec2),
+    views: wp.array(dtype=wp.vec3),
     low: wp.vec3,
     high: wp.vec3,
     reflectance: int,
@@ -281,10 +281,10 @@ def _place(
         if reflectance == 0 or means_nothing or not p[3] > 0.0:
             p[3] = 0.0
     z = p[2] + shift[b]
-    for t in range(turns.shape[0]):
-        x = turns[t][0] * p[0] - turns[t][1] * p[1]
-        y = turns[t][1] * p[0] + turns[t][0] * p[1]
-        placed[b, t, i] = wp.vec4(x, y, z, p[3])
+    for v in range(views.shape[0]):
+        x = views[v][0] * p[0] - views[v][1] * p[1]
+        y = views[v][2] * (views[v][1] * p[0] + views[v][0] * p[1])
+        placed[b, v, i] = wp.vec4(x, y, z, p[3])
         inside = x >= low[0] and x < high[0] and y >= low[1] and y < high[1] and z >= low[2] and z < high[2]
         if inside and p[3] > 1.0 + TOLERANCE:
             wp.atomic_max(extremes, b, 2, wp.cast(p[3], wp.int32))

@@ -508,7 +508,9 @@ def on_ground(flat: bool = True, ground: float | None = -1.645, **options: Any) 
 
 def sloped(rows: Tensor) -> Tensor:
     """Points or boxes on a road that rises by 0.4 % along x and falls by 0.3 % along y, from 0.2 m on."""
-    return torch.cat((rows[:, :2], rows[:, 2:3] + rows[:, :2] @ torch.tensor([[0.004], [-0.003]]) + 0.2, rows[:, 3:]), 1)
+    return torch.cat(
+        (rows[:, :2], rows[:, 2:3] + rows[:, :2] @ torch.tensor([[0.004], [-0.003]]) + 0.2, rows[:, 3:]), 1
+    )
 
 
 @both_ways

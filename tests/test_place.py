@@ -10,7 +10,7 @@ from torch import Tensor
 from hvnet.data.clouds import read_cloud
 from hvnet.data.sensor import as_points, find_ground, too_bright
 from hvnet.kernels.place import SAMPLED, ground_heights, place_points
-from hvnet.network.detector import turned
+from hvnet.network.views import View
 from tests.helpers import SHARED
 from tests.test_sensor import street
 
@@ -75,8 +75,8 @@ def spoilt(reflectance: list[float], count: int = 40) -> Tensor:
 
 
 @pytest.mark.parametrize("reflectance", [True, False])
-@pytest.mark.parametrize("angles", [(0.0,), (0.3, -2.0, math.pi)])
-def test_points_are_those_of_one_thread(angles: tuple[float, ...], reflectance: bool, device: torch.device) -> None:
+@pytest.mark.parametrize("views", [(View(0.0),), (View(0.3), View(-2.0, True), View(math.pi), View(0.0, True))])
+def test_points_are_those_of_one_thread(views: tuple[View, ...], reflectance: bool, device: torch.device) -> None:
     same = street(count=50)
     same[:, 3] = 0.5
     clouds = [
@@ -91,15 +91,15 @@ def test_points_are_those_of_one_thread(angles: tuple[float, ...], reflectance: 
         torch.zeros(0, 4),
     ]
     shift = torch.linspace(-2, 2, len(clouds))
-    turns = torch.tensor([[math.cos(angle), math.sin(angle)] for angle in angles])
+    rows = torch.tensor([[math.cos(angle), math.sin(angle), 1 - 2 * mirrored] for angle, mirrored in views])
     points, counts = padded(clouds, device)
-    placed, bright = place_points(points, counts, shift.to(device), turns.to(device), RANGE, reflectance)
-    assert placed.shape == (len(clouds), len(angles), points.shape[1], 4)
+    placed, bright = place_points(points, counts, shift.to(device), rows.to(device), RANGE, reflectance)
+    assert placed.shape == (len(clouds), len(views), points.shape[1], 4)
     for b, cloud in enumerate(clouds):
         moved = as_points(cloud) + torch.stack((shift[b] * 0, shift[b] * 0, shift[b], shift[b] * 0))
         if not reflectance:
             moved[:, 3] = 0
-        wanted = torch.stack([turned(moved, angle) for angle in angles])
+        wanted = torch.stack([view.see(moved) for view in views])
         found = placed[b, :, : len(cloud)].cpu()
         torch.testing.assert_close(found, wanted, rtol=0, atol=2e-5, equal_nan=True)
         assert torch.equal(found[..., 3], wanted[..., 3])
@@ -115,4 +115,6 @@ def test_other_arrays_are_refused() -> None:
     with pytest.raises(TypeError, match=r"counts: want dtype torch\.int32"):
         ground_heights(points, counts.long())
     with pytest.raises(ValueError, match="shift: want shape"):
-        place_points(points, counts, torch.zeros(2), torch.zeros(1, 2), RANGE, True)
+        place_points(points, counts, torch.zeros(2), torch.zeros(1, 3), RANGE, True)
+    with pytest.raises(ValueError, match="views: want shape"):
+        place_points(points, counts, torch.zeros(1), torch.zeros(1, 2), RANGE, True)

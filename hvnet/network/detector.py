@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from hvnet.boxes import limit_angle
 from hvnet.data.ground import cells_of, ground_map, heights_at, reach_of
 from hvnet.data.sensor import (
     FEW_IN_RANGE,
@@ -43,6 +42,7 @@ from hvnet.network.fused import inference, is_fused
 from hvnet.network.head import LOCATION_VALUES, Head, regress, scores_of, weight_of
 from hvnet.network.model import Detections, HVNet
 from hvnet.network.static import COLUMNS, BoxSteps, Rows, StaticFrame, capacity_of
+from hvnet.network.views import AUGMENTED, PLAIN, View, fuse, turned
 
 MAX_GRAPHS = 4
 """CUDA graphs that a detector keeps: each holds the memory of all that it calculates."""
@@ -53,9 +53,9 @@ SEAM = 2.0
 
 
 class Placed(NamedTuple):
-    """A cloud as the network sees it, once for every direction in which it looks."""
+    """A cloud as the network sees it, once for every view: in each direction in which it looks those of `Detector`."""
 
-    clouds: list[Tensor]  # of every direction the points (N, 4), turned so that it is along x
+    clouds: list[Tensor]  # of every view the points (N, 4), turned so that its direction is along x
     ground: Tensor  # () height of the ground before that, NaN where none was found
     shift: Tensor  # () metres by which they were raised
     relief: Tensor | None  # (S, S) metres by which they were then lowered at the places of `ground_map`; None: by none
@@ -94,6 +94,7 @@ class Detector:
     road lies elsewhere than that of the training data is raised or lowered, and its boxes are moved back.
     turn: degrees, counter-clockwise, by which a cloud is turned before detection, so that its forward is along x.
     all_round: look in as many directions as the range's opening needs; each decides what is straight ahead of it.
+    tta: test-time augmentation: see the cloud turned a little and mirrored as well, and average the boxes.
     """
 
     def __init__(
@@ -107,6 +108,7 @@ class Detector:
         sensor_height: float | Literal["found", "none"] = "found",
         turn: float = 0.0,
         all_round: bool = False,
+        tta: bool = False,
     ) -> None:
         if sensor_height not in ("found", "none") and not _is_number(sensor_height):
             raise ValueError(f"sensor_height: want metres, 'found' or 'none', got {sensor_height!r}")
@@ -117,6 +119,8 @@ class Detector:
         self.reach = reach_of(model.config.encoder.point_range)
         turns = 1 if not all_round else turns_all_round(model.config.encoder.point_range)
         self.turns = [math.radians((turn + 360 * k / turns) % 360) for k in range(turns)]
+        self.views_of_turn = AUGMENTED if tta else PLAIN
+        self.views = [view._replace(angle=turn + view.angle) for turn in self.turns for view in self.views_of_turn]
         self.device = device
         self.dtype = dtype or fastest_dtype(device)
         self.config = model.config
@@ -136,7 +140,8 @@ class Detector:
         self.anchors = [model.anchors(label) for label in range(len(heads))]
         # for many threads
         self.steps = BoxSteps(self.config.head, self.regression_weights, self.anchors)
-        self.cosines = torch.tensor([[math.cos(turn), math.sin(turn)] for turn in self.turns], device=device)
+        rows = [[math.cos(angle), math.sin(angle), -1.0 if mirrored else 1.0] for angle, mirrored in self.views]
+        self.view_rows = torch.tensor(rows, device=device)
         self.fixed_shift = torch.zeros(1, device=device)
         if ground is not None and sensor_height not in ("found", "none"):
             self.fixed_shift = shift_to(torch.tensor([-float(sensor_height)]), ground).to(device)
@@ -161,11 +166,11 @@ class Detector:
         for k, move in enumerate(moves):
             if move.bright:
                 raise ValueError(reflectance_error(move.bright))
-            results.append(self.take_back(found[k * len(self.turns) : (k + 1) * len(self.turns)], move))
+            results.append(self.take_back(found[k * len(self.views) : (k + 1) * len(self.views)], move))
         return results
 
     def batch_of_one(self, clouds: Sequence[Tensor | NDArray]) -> tuple[list[Detections], list[Move]]:
-        """What one thread finds in every direction of every cloud (N, 4), and how it has moved them."""
+        """What one thread finds in every view of every cloud (N, 4), and how it has moved them."""
         placed = [self.place(cloud) for cloud in clouds]
         parts = [part for each in placed for part in each.clouds]
         points = torch.cat(parts)
@@ -182,12 +187,12 @@ class Detector:
         if key not in self.frames:
             while len(self.frames) >= MAX_GRAPHS:
                 del self.frames[next(iter(self.frames))]
-            frame = StaticFrame(*key, len(self.turns), self.device)
-            if self.device.type == "cuda" and self.is_fused(len(checked) * len(self.turns)):
+            frame = StaticFrame(*key, len(self.views), self.device)
+            if self.device.type == "cuda" and self.is_fused(len(checked) * len(self.views)):
                 frame.capture(self.numbers)
             self.frames[key] = frame
         output = self.frames[key](checked, self.numbers)
-        size = (len(checked) * len(self.turns), len(self.classes), self.steps.kept, COLUMNS)
+        size = (len(checked) * len(self.views), len(self.classes), self.steps.kept, COLUMNS)
         table, moves = output.split((math.prod(size), len(output) - math.prod(size)))
         (bright, shift), reliefs = moves[: 2 * len(checked)].view(2, -1).tolist(), [None] * len(checked)
         if self.is_flat:
@@ -198,7 +203,7 @@ class Detector:
         """By many threads all that is found in clouds (B, N, 4) of counts (B,) int32, in one row: the table of
         `BoxSteps.suppress`, for every cloud its brightest reflectance, its shift and, if it was flattened, its relief.
 
-        sample: the direction of a cloud (B T N,) int64 that each point is turned to.
+        sample: the view of a cloud (B V N,) int64 that each point is seen in.
         """
         shift, reliefs = self.shifts(points, counts), []
         if self.is_flat:
@@ -210,8 +215,8 @@ class Detector:
             points = torch.cat((points[..., :2], lowered[..., None], points[..., 3:]), dim=2)
             reliefs = [relief.flatten()]
         point_range = self.config.encoder.point_range
-        placed, bright = place_points(points, counts, shift, self.cosines, point_range, self.reflectance)
-        levels = self.backbone(self.encode(placed.view(-1, 4), sample, len(points) * len(self.turns)))
+        placed, bright = place_points(points, counts, shift, self.view_rows, point_range, self.reflectance)
+        levels = self.backbone(self.encode(placed.view(-1, 4), sample, len(points) * len(self.views)))
         table = self.steps.suppress(self.steps.candidates(levels, self.steps.keys(self.score_maps(levels))))
         return torch.cat((table.flatten(), bright, shift, *reliefs))
 
@@ -229,7 +234,7 @@ class Detector:
         return self.fixed_shift.expand(len(points)).contiguous()
 
     def place(self, cloud: Tensor | NDArray) -> Placed:
-        """Moves a cloud (N, 4) to where the network expects its road, and turns it."""
+        """Moves a cloud (N, 4) to where the network expects its road, and turns it to every view."""
         points = as_points(cloud, self.device)
         if not self.reflectance:
             points = torch.cat((points[:, :3], torch.zeros_like(points[:, :1])), dim=1)
@@ -248,7 +253,7 @@ class Detector:
             lowered = points[:, 2:3] - heights_at(relief, points[None, :, :2])[0, :, None]
             points = torch.cat((points[:, :2], lowered, points[:, 3:]), dim=1)
             relief = relief[0]
-        clouds = [turned(points, angle) for angle in self.turns]
+        clouds = [view.see(points) for view in self.views]
         bright = torch.stack([too_bright(each, self.config.encoder.point_range) for each in clouds]).amax()
         return Placed(clouds, ground, shift, relief, bright)
 
@@ -274,7 +279,11 @@ class Detector:
         return *low, z_min - shift, *high, z_max - shift
 
     def take_back(self, found: Sequence[Detections], move: Move) -> Detections:
-        """The boxes of a cloud, found in every direction, in its own axes: those straight ahead, joined by NMS."""
+        """The boxes of a cloud, found in every view, in its own axes: those straight ahead, joined by NMS."""
+        if len(self.views) > len(self.turns):
+            count, head, point_range = len(self.views_of_turn), self.config.head, self.config.encoder.point_range
+            starts = range(0, len(found), count)
+            found = [fuse(found[k : k + count], self.views_of_turn, head, point_range) for k in starts]
         if len(self.turns) == 1 and not self.turns[0] and not move.shift and move.relief is None:
             return found[0]
         parts = []
@@ -284,12 +293,10 @@ class Detector:
                 sideways = torch.atan2(y, x).abs() - math.pi / len(self.turns)  # radians past the look's border
                 beyond = torch.hypot(x, y) * sideways.clamp(0, math.pi / 2).sin()  # metres
                 each = each.select(beyond <= SEAM)
-            boxes = turned(each.boxes, -angle)
+            boxes = View(angle).take_back(each.boxes)
             if move.relief is not None:
-                boxes = boxes.clone()
                 boxes[:, 2] += heights_at(move.relief[None], boxes[None, :, :2])[0]
             boxes[:, 2] -= move.shift
-            boxes[:, 6] = limit_angle(boxes[:, 6] - angle)
             parts.append(each._replace(boxes=boxes))
         joined = Detections(*(torch.cat(column) for column in zip(*parts, strict=True)))
         if len(self.turns) == 1:
@@ -416,15 +423,6 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def turned(rows: Tensor, angle: float) -> Tensor:
-    """Points (N, 4) or boxes (M, 7) with their x and y turned by an angle in radians, counter-clockwise."""
-    if not angle:
-        return rows
-    x, y = rows[:, :1], rows[:, 1:2]
-    cos, sin = math.cos(angle), math.sin(angle)
-    return torch.cat((cos * x - sin * y, sin * x + cos * y, rows[:, 2:]), dim=1)
-
-
 def turns_all_round(point_range: Sequence[float]) -> int:
     """In how many directions a range x_min, y_min, z_min, x_max, y_max, z_max has to look to see all round.
 
@@ -447,11 +445,12 @@ def load(
     sensor_height: float | Literal["found", "none"] = "found",
     turn: float = 0.0,
     all_round: bool = False,
+    tta: bool = False,
 ) -> Detector:
     """A detector from a checkpoint of `python -m hvnet.train`, or from weights that come with the package.
 
     checkpoint: a file, or the name of weights, such as "compact", which is the default.
-    device: auto (CUDA where there is a GPU), cpu, cuda or cuda:N. sensor_height, turn, all_round: see `Detector`.
+    device: auto (CUDA where there is a GPU), cpu, cuda or cuda:N. sensor_height, turn, all_round, tta: see `Detector`.
     Raises InputError naming the file, or the device.
     """
     path = find_checkpoint(checkpoint)
@@ -472,4 +471,5 @@ def load(
         sensor_height=sensor_height,
         turn=turn,
         all_round=all_round,
+        tta=tta,
     )
