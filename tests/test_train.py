@@ -24,9 +24,10 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor
 
-from hvnet.config import Config, TrainConfig
+from hvnet.config import Config, TrainConfig, load_config
 from hvnet.data.gt_database import read_database
 from hvnet.data.kitti import KittiFrames, read_split
+from hvnet.evaluation.scoring import score
 from hvnet.exceptions import InputError, Stopped
 from hvnet.kernels import launch
 from hvnet.network.checkpoint import load_checkpoint, save_checkpoint
@@ -34,7 +35,7 @@ from hvnet.network.detector import Detector, load
 from hvnet.network.model import HVNet
 from hvnet.train import choose_out, main
 from hvnet.training import run as run_module
-from hvnet.training.batches import collate, kitti_data
+from hvnet.training.batches import TrainingFrames, collate, kitti_data
 from hvnet.training.run import Progress, Run, learning_rate
 from tests.helpers import ROOT, contents, same
 from tests.models import SHORT
@@ -227,9 +228,9 @@ def test_averaged_weights(
     changes = ["train.average=0.3", "train.report_every=2"]
     validated, detector = [], run_module.Detector
 
-    def noted(model: HVNet, device: torch.device) -> Detector:
+    def noted(model: HVNet, device: torch.device, **options: Any) -> Detector:
         validated.append(copy.deepcopy(model.state_dict()))
-        return detector(model, device)
+        return detector(model, device, **options)
 
     with monkeypatch.context() as patched:
         patched.setattr(run_module, "Detector", noted)
@@ -253,6 +254,35 @@ def test_averaged_weights(
     save_checkpoint(tmp_path / "out" / "checkpoint.pt", {key: value for key, value in whole.items() if key != "raw"})
     with pytest.raises(InputError, match=r"does not hold a whole run \('raw'\)"):
         run(scenes, tmp_path / "out", *changes, resume=True)
+
+
+def test_a_flat_run_detects_as_it_was_validated(scenes: Path, tmp_path: Path) -> None:
+    """Its clouds and boxes are flattened to the ground that the checkpoint keeps; inserted objects stand there."""
+    changes = ["encoder.flat_ground=true", "augment.translation=[0, 0, 0]", "augment.scaling=[1, 1]"]
+    config = load_config(DEMO, [*SHORT, *changes])
+    made = Run(config, kitti_data(scenes, config), tmp_path / "run")
+    record = [made.epoch() for _ in range(2)][-1]
+    detector = load(tmp_path / "run" / "checkpoint.pt", "cpu")
+    assert detector.is_flat
+    assert detector.ground == made.sensor["ground"] == pytest.approx(-1.73, abs=0.1)
+    found = score(detector, made.data.val)
+    for name, measures in record["validation"].items():
+        assert measures == {measure: found[name][measure] for measure in measures}
+    frames = made.loader.dataset
+    assert isinstance(frames, TrainingFrames)
+    for k in range(4):
+        sample = frames.augmented(0, k)
+        bottoms = sample.boxes[:, 2] - sample.boxes[:, 5] / 2
+        assert len(bottoms) > len(frames.read(k % len(frames.frames)).boxes)
+        assert (bottoms - detector.ground).abs().max() < 0.15
+
+
+def test_clouds_without_a_ground_stay_as_they_are(copied: Path, tmp_path: Path) -> None:
+    for cloud in (copied / "training" / "velodyne").iterdir():
+        np.fromfile(cloud, np.float32)[:40].tofile(cloud)
+    printed = run(copied, tmp_path / "run", "encoder.flat_ground=true", "train.epochs=1")
+    assert "no ground is found in the clouds, so that slopes stay" in printed
+    assert not load(tmp_path / "run" / "checkpoint.pt", "cpu").is_flat
 
 
 def test_an_average_begins_at_once(scenes: Path, tiny: Config, tmp_path: Path, threads: None) -> None:

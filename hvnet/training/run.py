@@ -172,9 +172,7 @@ class Run:
             objects = sampler_of(training_objects(data, good, self.say), place)
         ground = self.sensor["ground"] if config.encoder.flat_ground else None
         if config.encoder.flat_ground and ground is None:
-            raise InputError(
-                "no ground is found in the clouds; give data.sensor_height, or train with encoder.flat_ground=false"
-            )
+            self.say("no ground is found in the clouds, so that slopes stay; data.sensor_height tells its height")
         return DataLoader(
             TrainingFrames(data.train, config, objects, place, data.drives, ground),
             batch_sampler=order,
