@@ -111,6 +111,8 @@ class Watch(TorchDispatchMode):
         if "batch_norm" in name:  # torch's fake writes running statistics in a way that asks for a device guard
             channels = args[0].shape[1]
             output = torch.empty_like(args[0]), args[0].new_empty(channels), args[0].new_empty(channels)
+        elif name.endswith("grid_sampler_2d"):  # its fake indexes
+            output = args[0].new_empty(*args[0].shape[:2], *args[1].shape[1:3])
         elif name == "cudnn_convolution_relu":  # a build without CUDA has no fake of it
             image, weight, bias, stride, padding, dilation, groups = args
             output = CONVOLUTION.default(image, weight, bias, stride, padding, dilation, False, [0, 0], groups)

@@ -272,9 +272,9 @@ def test_a_flat_run_detects_as_it_was_validated(scenes: Path, tmp_path: Path) ->
     assert isinstance(frames, TrainingFrames)
     for k in range(4):
         sample = frames.augmented(0, k)
-        bottoms = sample.boxes[:, 2] - sample.boxes[:, 5] / 2
-        assert len(bottoms) > len(frames.read(k % len(frames.frames)).boxes)
-        assert (bottoms - detector.ground).abs().max() < 0.15
+        above = sample.boxes[:, 2] - sample.boxes[:, 5] / 2 - detector.ground
+        assert (above.abs() < 1e-5).sum() >= 3  # inserted; the estimate under the others is not perfect
+        assert above.abs().max() < 0.3
 
 
 def test_clouds_without_a_ground_stay_as_they_are(copied: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import hvnet
 from hvnet.config import Config
 from hvnet.data.kitti import read_frame
 from hvnet.kernels.rotated import rotated_iou_bev
-from hvnet.network.detector import Detector
+from hvnet.network.detector import Detector, Move
 from hvnet.network.model import Detections
 from hvnet.network.views import AUGMENTED, View, fuse
 from tests.models import lively, some_points
@@ -164,4 +164,4 @@ def test_without_it_a_detector_has_one_view(demo: Config) -> None:
     assert detector.views == [View(0.0)]
     assert torch.equal(detector.place(points).clouds[0], points)
     found = Detections(torch.rand(3, 7), torch.rand(3), torch.zeros(3).long())
-    assert detector.take_back([found], 0.0) is found
+    assert detector.take_back([found], Move(0.0, 0.0, None)) is found

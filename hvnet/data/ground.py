@@ -44,7 +44,9 @@ def ground_map(points: Tensor, reach: float) -> Tensor:
     heights = _low_heights(points, side).double()
     centre = (torch.arange(side, device=points.device, dtype=torch.float64) - (side - 1) / 2) * CELL
     rows = torch.cat((torch.cartesian_prod(centre, centre), torch.ones_like(heights[0])[:, None]), dim=1)
-    weight = ((heights - heights.nanmedian(dim=1, keepdim=True).values).abs() < SPREAD).double()
+    middle = (heights.isfinite().sum(dim=1, keepdim=True) - 1).clamp(min=0) // 2
+    median = heights.sort(dim=1).values.gather(1, middle)  # NaN comes last
+    weight = ((heights - median).abs() < SPREAD).double()
     found = weight.sum(dim=1) >= FEWEST_CELLS
     # level where the cells lie on a line and say nothing across it
     level = torch.eye(3, dtype=torch.float64, device=points.device)

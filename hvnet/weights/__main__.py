@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None) -> None:
         "Makes weights of the package anew: trains by a recipe and writes the result in half precision. The root is "
         "the part of KITTI that docs/model_card.md names, with the objects of all 3712 training frames in "
         "gt_database.npz. For two processes that train together, replace python with torchrun --nproc-per-node 2.",
-        ["--data /data/kitti", "--data /data/kitti --name standard", "--data /data/kitti --resume"],
+        ["--data /data/kitti", "--data /data/kitti --resume"],
     )
     names = sorted(path.stem for path in RECIPES.glob("*.yaml"))
     parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="a KITTI root with gt_database.npz")
