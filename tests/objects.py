@@ -7,7 +7,7 @@ import torch
 from torch import Generator, Tensor
 
 from hvnet.data.gt_database import Database
-from hvnet.data.insert import ObjectSampler, sampler_of
+from hvnet.data.insert import ObjectSampler, TrainingFrame, sampler_of
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 COUNTS = {"Car": 15, "Pedestrian": 8, "Cyclist": 8}
@@ -49,7 +49,7 @@ def make_objects(objects: list[tuple[str, list[float]]], points_each: int = 10, 
         occlusion=np.array(arrays["occlusion"], dtype=np.int8),
         bbox_height=np.array(arrays["bbox_height"], dtype=np.float32),
     )
-    return sampler_of(database, torch.device("cpu"))
+    return sampler_of(database)
 
 
 def points_of(objects: ObjectSampler, k: int) -> Tensor:
@@ -60,5 +60,8 @@ def car(x: float, y: float, yaw: float = 0.0) -> list[float]:
     return [x, y, -1.0, 4.0, 2.0, 1.5, yaw]
 
 
-def no_boxes() -> tuple[Tensor, Tensor]:
-    return torch.zeros(0, 7), torch.zeros(0, dtype=torch.int64)
+def unlabelled(points: Tensor | None = None) -> TrainingFrame:
+    """A frame of points (N, 4), of none by default, without boxes."""
+    return TrainingFrame(
+        torch.zeros(0, 4) if points is None else points, torch.zeros(0, 7), torch.zeros(0, dtype=torch.int64)
+    )

@@ -19,9 +19,9 @@ from hvnet.data.augment import (
     random_translation,
 )
 from hvnet.data.gt_database import read_database
-from hvnet.data.insert import sample_objects, sampler_of
+from hvnet.data.insert import TrainingFrame, sample_objects, sampler_of
 from hvnet.data.kitti import read_frame
-from tests.objects import CLASSES, COUNTS, car, make_objects, no_boxes, points_of, scene, seeded
+from tests.objects import CLASSES, COUNTS, car, make_objects, points_of, scene, seeded, unlabelled
 
 
 def test_flip() -> None:
@@ -98,7 +98,9 @@ def test_points_stay_in_their_boxes(seed: int) -> None:
     assert before.sum() > 300
     options = AugmentConfig(flip=1.0)
     labels = torch.zeros(len(boxes), dtype=torch.int64)
-    moved, moved_boxes, moved_labels = augment(points, boxes, labels, None, options, seeded(seed), CLASSES)
+    moved, moved_boxes, moved_labels = augment(
+        TrainingFrame(points, boxes, labels), None, options, seeded(seed), CLASSES
+    )
     assert not torch.allclose(moved[:, :3], points[:, :3], atol=0.1)
     assert torch.equal(moved[:, 3], points[:, 3])
     assert torch.equal(moved_labels, labels)
@@ -114,14 +116,14 @@ def test_augment_repeats_with_its_seed() -> None:
     database = make_objects([("Car", car(x, 60.0)) for x in range(0, 60, 6)])
     options = AugmentConfig(objects={"Car": 15})
     first, again, other = (
-        augment(points, boxes, labels, database, options, seeded(seed), CLASSES) for seed in (7, 7, 8)
+        augment(TrainingFrame(points, boxes, labels), database, options, seeded(seed), CLASSES) for seed in (7, 7, 8)
     )
     assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
     assert not torch.equal(first[0], other[0])
 
 
 def test_augment_of_nothing() -> None:
-    points, boxes, labels = augment(torch.zeros(0, 4), *no_boxes(), None, AugmentConfig(), seeded(), CLASSES)
+    points, boxes, labels = augment(unlabelled(), None, AugmentConfig(), seeded(), CLASSES)
     assert points.shape == (0, 4)
     assert boxes.shape == (0, 7)
     assert labels.shape == (0,)
@@ -136,8 +138,8 @@ def test_mixed_sectors_meet_at_a_border() -> None:
     boxes, labels = torch.tensor(around), torch.tensor([0, 1, -1])
     outcomes = set()
     for seed in range(20):
-        others = (other_ring, boxes.clone(), labels + 20)
-        points, kept, of_kept = mix_sectors(ring, boxes, labels, others, seeded(seed))
+        other = TrainingFrame(other_ring, boxes.clone(), labels + 20)
+        points, kept, of_kept = mix_sectors(TrainingFrame(ring, boxes, labels), other, seeded(seed))[:3]
         own = of_kept < 10
         assert len(kept) == 3  # the two frames have boxes at the same three places
         outcomes.add(tuple(sorted(of_kept.tolist())))
@@ -154,8 +156,7 @@ def test_mixed_sectors_meet_at_a_border() -> None:
 def test_mixing_with_an_empty_frame_leaves_a_side() -> None:
     points, boxes = scene()
     labels = torch.zeros(len(boxes), dtype=torch.int64)
-    nothing = (torch.zeros(0, 4), *no_boxes())
-    left, left_boxes, _ = mix_sectors(points, boxes, labels, nothing, seeded(1))
+    left, left_boxes, _ = mix_sectors(TrainingFrame(points, boxes, labels), unlabelled(), seeded(1))[:3]
     assert 0 < len(left) < len(points)
     assert 0 < len(left_boxes) < len(boxes)
     inside = points_in_boxes(points, left_boxes).any(1)
@@ -172,8 +173,10 @@ def test_many_threads_keep_rows_of_nan(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def augmented(seed: int) -> tuple[Tensor, Tensor, Tensor]:
         generator, labels = seeded(seed), torch.arange(12) % 3
-        mixed = mix_sectors(*scene(seed), labels, (*scene(seed + 50), labels), generator)
-        return augment(*mixed, objects, options, generator, CLASSES, None if seed % 2 else -1.6)
+        frame, other = (TrainingFrame(*scene(each), labels) for each in (seed, seed + 50))
+        return augment(
+            mix_sectors(frame, other, generator), objects, options, generator, CLASSES, None if seed % 2 else -1.6
+        )
 
     one = [augmented(seed) for seed in range(8)]
     monkeypatch.setattr("hvnet.kernels.launch.force_many_threads", True)
@@ -188,12 +191,13 @@ def test_many_threads_keep_rows_of_nan(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_real_frame_with_the_real_database(kitti_root: Path) -> None:
-    database = sampler_of(read_database(kitti_root / "gt_database.npz"), torch.device("cpu"))
+    database = sampler_of(read_database(kitti_root / "gt_database.npz"))
     frame = read_frame(kitti_root, "000008")
     assert frame.objects is not None
     own_boxes, names = frame.objects.boxes, frame.objects.names
     labels = torch.tensor([CLASSES.index(name) if name in CLASSES else -1 for name in names])
-    points, boxes, classes = sample_objects(frame.points, own_boxes, labels, database, COUNTS, seeded(), CLASSES)
+    street = TrainingFrame(frame.points, own_boxes, labels)
+    points, boxes, classes = sample_objects(street, database, COUNTS, seeded(), CLASSES)[:3]
     inserted = boxes[len(own_boxes) :]
     assert 15 < len(inserted) <= 25
     assert torch.equal(boxes[: len(own_boxes)], own_boxes)

@@ -22,7 +22,7 @@ IDS = ["000000", "000001", "000002"]
 
 
 def test_an_item_depends_on_seed_epoch_and_number_alone(scenes: Path, tiny: Config) -> None:
-    objects = sampler_of(load_database(scenes, IDS, []), CPU)
+    objects = sampler_of(load_database(scenes, IDS, []))
 
     def frames(seed: int = 0) -> TrainingFrames:
         config = dataclasses.replace(tiny, train=dataclasses.replace(tiny.train, seed=seed))
@@ -41,7 +41,7 @@ def test_an_item_depends_on_seed_epoch_and_number_alone(scenes: Path, tiny: Conf
 
 def test_no_object_is_inserted_in_the_last_epochs(scenes: Path, tiny: Config) -> None:
     """Of three epochs two have more objects than the frames themselves, the same as without fading."""
-    objects = sampler_of(load_database(scenes, IDS, []), CPU)
+    objects = sampler_of(load_database(scenes, IDS, []))
 
     def boxes(fade_out: int, **changes: object) -> list[int]:
         augmentation = dataclasses.replace(tiny.augment, fade_out=fade_out, rotation=0.0, **changes)

@@ -24,7 +24,7 @@ import hvnet
 from hvnet.config import AugmentConfig, Config, EncoderConfig, load_config
 from hvnet.data.augment import augment, mix_sectors
 from hvnet.data.gt_database import load_database
-from hvnet.data.insert import sampler_of
+from hvnet.data.insert import TrainingFrame, sampler_of
 from hvnet.data.kitti import read_split
 from hvnet.data.scenes.files import make_frame
 from hvnet.data.scenes.street import Options
@@ -453,17 +453,19 @@ def test_augmented_clouds(scenes: Path) -> None:
     names, classes = read_split(scenes, "train"), ("Car", "Pedestrian", "Cyclist")
     database = load_database(scenes, names, [])
     points, boxes = some_points(3000), random_boxes(4, 0, centre=6).float()
-    others = some_points(2500, seed=1), random_boxes(3, 1, centre=5).float(), torch.tensor([1, 0, 2])
-    labels = torch.tensor([0, 1, 2, 0])
+    frame = TrainingFrame(points, boxes, torch.tensor([0, 1, 2, 0]))
+    points = some_points(2500, seed=1)
+    boxes, labels = random_boxes(3, 1, centre=5).float(), torch.tensor([1, 0, 2])
+    other = TrainingFrame(points, boxes, labels)
     for seed in range(12):
         options = AugmentConfig(objects={"Car": 8, "Pedestrian": 4}, whole_frames=0.3)
         results = []
         for device in (CPU, GPU):
             generator = torch.Generator().manual_seed(seed)
-            elsewhere = others[0].to(device), others[1], others[2]
-            mixed = mix_sectors(points.to(device), boxes, labels, elsewhere, generator)
+            there = [each._replace(points=each.points.to(device)) for each in (frame, other)]
+            mixed = mix_sectors(*there, generator)
             results.append(
-                augment(*mixed, sampler_of(database, device), options, generator, classes, -1.6 if seed % 2 else None)
+                augment(mixed, sampler_of(database), options, generator, classes, -1.6 if seed % 2 else None)
             )
         (want, *rest), (got, *same_rest) = results
         assert got.device.type == GPU.type

@@ -14,6 +14,7 @@ from hvnet.config import AugmentConfig
 from hvnet.data.augment import augment
 from hvnet.data.kitti import read_frame, read_split
 from hvnet.data.other_sensors import find_beams, random_pitch, random_reflectance, unseen_by_fewer_beams
+from tests.objects import unlabelled
 
 STILL = AugmentConfig(flip=0, rotation=0, scaling=(1, 1), translation=(0, 0, 0))
 
@@ -85,10 +86,10 @@ def test_whole_beams_are_left_out() -> None:
 def test_inserted_objects_share_the_beams_of_the_street() -> None:
     """Points are thinned alike wherever they stand in the cloud, and by chance with the given probability."""
     points, _ = rings(100)
-    options, nothing = replace(STILL, fewer_beams=0.5), (torch.zeros(0, 7), torch.zeros(0, dtype=torch.int64))
+    options = replace(STILL, fewer_beams=0.5)
     thinned = []
     for seed in range(100):
-        left, _, _ = augment(torch.cat((points, points)), *nothing, None, options, seeded(seed), ())
+        left, _, _ = augment(unlabelled(torch.cat((points, points))), None, options, seeded(seed), ())
         street, objects = left.chunk(2)
         assert torch.equal(street, objects)
         thinned.append(len(street) < len(points))
@@ -147,7 +148,7 @@ def test_what_is_off_draws_nothing(changes: dict[str, object]) -> None:
     """The bits are those of a frame that is flipped, turned, scaled and moved alone."""
     points, _ = rings(20)
     generator, plain = seeded(5), seeded(5)
-    augment(points, torch.zeros(0, 7), torch.zeros(0).long(), None, AugmentConfig(**changes), generator, ())  # type: ignore[arg-type]
+    augment(unlabelled(points), None, AugmentConfig(**changes), generator, ())  # type: ignore[arg-type]
     torch.rand((), generator=plain)  # whether it is flipped
     torch.rand((), generator=plain)  # the rotation
     torch.rand((), generator=plain)  # the scaling

@@ -91,7 +91,7 @@ def test_a_step_waits_for_the_encoder_alone(scenes: Path, tiny: Config, tmp_path
 def test_augmentation_reads_no_point(scenes: Path, tiny: Config) -> None:
     """On the device "meta" there are shapes and no numbers: what reads one raises."""
     meta = torch.device("meta")
-    objects = sampler_of(load_database(scenes, ["000000", "000001", "000002"], []), meta)
+    objects = sampler_of(load_database(scenes, ["000000", "000001", "000002"], []))
     changes = {"mix": 0.5, "whole_frames": 0.5, "fewer_beams": 1.0, "no_reflectance": 0.5, "pitch": 0.02}
     config = dataclasses.replace(tiny, augment=dataclasses.replace(tiny.augment, **changes))
     frames = TrainingFrames(KittiFrames(scenes, ["000000", "000001", "000002"]), config, objects, meta)

@@ -12,21 +12,19 @@ from torch import Generator, Tensor
 
 from hvnet.boxes import limit_angle, points_in_boxes
 from hvnet.config import AugmentConfig
-from hvnet.data.insert import ObjectSampler, drop, sample_frame, sample_objects, send
+from hvnet.data.insert import ObjectSampler, TrainingFrame, drop, sample_frame, sample_objects, send
 from hvnet.data.other_sensors import random_pitch, random_reflectance, unseen_by_fewer_beams
 
 
 def augment(
-    points: Tensor,
-    boxes: Tensor,
-    labels: Tensor,
+    frame: TrainingFrame,
     objects: ObjectSampler | None,
     options: AugmentConfig,
     generator: Generator,
     classes: Sequence[str],
     ground: float | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Augments one frame: points (N, 4), boxes (M, 7) and labels (M,), which number the boxes' classes in `classes`.
+    """Augments one frame: returns points (N, 4), boxes (M, 7) and labels (M,), which number the boxes' `classes`.
 
     ground: height of a flat ground, on which inserted objects stand; None: they keep their own height.
 
@@ -38,11 +36,10 @@ def augment(
     """
     if objects is not None:
         if options.whole_frames and torch.rand((), generator=generator).item() < options.whole_frames:
-            points, boxes, labels = sample_frame(points, boxes, labels, objects, generator, classes, ground)
+            frame = sample_frame(frame, objects, generator, classes, ground)
         else:
-            points, boxes, labels = sample_objects(
-                points, boxes, labels, objects, options.objects, generator, classes, ground
-            )
+            frame = sample_objects(frame, objects, options.objects, generator, classes, ground)
+    points, boxes, labels = frame.points, frame.boxes, frame.labels
     # after the insertion, and before a point leaves the beam that saw it
     if options.fewer_beams and torch.rand((), generator=generator).item() < options.fewer_beams:
         points = drop(points, unseen_by_fewer_beams(points, generator))
@@ -101,15 +98,9 @@ def random_translation(
     return points, boxes
 
 
-def mix_sectors(
-    points: Tensor,
-    boxes: Tensor,
-    labels: Tensor,
-    others: tuple[Tensor, Tensor, Tensor],
-    generator: Generator,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Takes everything on one side of a direction from another frame (points, boxes, labels), as PolarMix (Xiao et al.,
-    2022) swaps sectors of scans.
+def mix_sectors(frame: TrainingFrame, other: TrainingFrame, generator: Generator) -> TrainingFrame:
+    """Takes everything on one side of a direction from another frame, as PolarMix (Xiao et al., 2022) swaps sectors of
+    scans.
 
     The direction is uniform within 30 degrees of straight ahead. A box belongs to the side of its centre and keeps its
     points beyond the border, where they replace the points of the frame on that side.
@@ -117,25 +108,28 @@ def mix_sectors(
     border = _uniform(-math.pi / 6, math.pi / 6, generator)
     left_from_other = torch.rand((), generator=generator).item() < 0.5
 
-    def left(rows: Tensor) -> Tensor:
-        return torch.atan2(rows[:, 1], rows[:, 0]) > border
-
-    kept_boxes, other_boxes = left(boxes) != left_from_other, left(others[1]) == left_from_other
-    own, own_labels = boxes[kept_boxes], labels[kept_boxes]
-    new, new_labels = others[1][other_boxes], others[2][other_boxes]
+    def on_own_side(rows: Tensor) -> Tensor:
+        return (torch.atan2(rows[:, 1], rows[:, 0]) > border) != left_from_other
 
     def within(cloud: Tensor, among: Tensor) -> Tensor:
         return points_in_boxes(cloud, send(among, cloud.device)).any(dim=1)
 
-    in_own, in_new = within(points, own), within(points, new)
-    from_own, from_new = within(others[0], own), within(others[0], new)
-    stays = (in_own | (left(points) != left_from_other)) & ~(in_new & ~in_own)
-    comes = (from_new | (left(others[0]) == left_from_other)) & ~(from_own & ~from_new)
+    kept, taken = on_own_side(frame.boxes), ~on_own_side(other.boxes)
+    own, new = frame.boxes[kept], other.boxes[taken]
+    in_own, in_new = within(frame.points, own), within(frame.points, new)
+    from_own, from_new = within(other.points, own), within(other.points, new)
+    stays = (in_own | on_own_side(frame.points)) & ~(in_new & ~in_own)
+    comes = (from_new | ~on_own_side(other.points)) & ~(from_own & ~from_new)
     # half of an object that is removed with the other side must not stay behind
-    stays &= ~within(points, boxes[~kept_boxes]) | in_own
-    comes &= ~within(others[0], others[1][~other_boxes]) | from_new
-    cloud = torch.cat((drop(points, ~stays), drop(others[0], ~comes)))
-    return cloud, torch.cat((own, new)), torch.cat((own_labels, new_labels))
+    stays &= ~within(frame.points, frame.boxes[~kept]) | in_own
+    comes &= ~within(other.points, other.boxes[~taken]) | from_new
+    return TrainingFrame(
+        torch.cat((drop(frame.points, ~stays), drop(other.points, ~comes))),
+        torch.cat((own, new)),
+        torch.cat((frame.labels[kept], other.labels[taken])),
+        "\n".join(filter(None, (frame.note, other.note))),
+        frame.name,
+    )
 
 
 def _uniform(low: float, high: float, generator: Generator) -> float:

@@ -20,17 +20,27 @@ MIN_POINTS = 5
 """Objects of fewer points are not inserted, as in SECOND."""
 
 
+class TrainingFrame(NamedTuple):
+    """A frame as training reads it. All but the points is on the host."""
+
+    points: Tensor  # (N, 4), on the GPU when training on one
+    boxes: Tensor  # (M, 7)
+    labels: Tensor  # (M,) int64, index into the config's classes, or -1
+    note: str = ""
+    name: str = ""
+
+
 class ObjectSampler(NamedTuple):
     """A ground-truth database that is ready to draw from."""
 
     database: Database
-    points: Tensor  # (M, 4) of all objects, on the device of the frames
+    points: Tensor  # (M, 4) of all objects
     of_class: dict[str, np.ndarray]  # rows of each class that `sample_objects` draws from
     of_frame: list[np.ndarray]  # rows of each frame that `sample_frame` inserts
 
 
-def sampler_of(database: Database, device: torch.device) -> ObjectSampler:
-    """The database with its points on a device, and its rows by class and by frame."""
+def sampler_of(database: Database) -> ObjectSampler:
+    """The database with its points, and its rows by class and by frame."""
     has_points = np.diff(database.offsets) >= MIN_POINTS
     # rated by KITTI: easy, moderate or hard; SECOND leaves out the others. Without a camera there are no heights
     high = (database.bbox_height > 25) | (not database.bbox_height.any())
@@ -39,7 +49,7 @@ def sampler_of(database: Database, device: torch.device) -> ObjectSampler:
     by_frame = np.argsort(database.frame, kind="stable")
     _, starts = np.unique(database.frame[by_frame], return_index=True)
     of_frame = [rows[has_points[rows]] for rows in np.split(by_frame, starts[1:])]
-    return ObjectSampler(database, object_points(database).to(device), of_class, of_frame)
+    return ObjectSampler(database, object_points(database), of_class, of_frame)
 
 
 def send(tensor: Tensor, device: torch.device) -> Tensor:
@@ -58,89 +68,85 @@ def drop(points: Tensor, gone: Tensor) -> Tensor:
 
 
 def sample_objects(
-    points: Tensor,
-    boxes: Tensor,
-    labels: Tensor,
+    frame: TrainingFrame,
     objects: ObjectSampler,
     counts: Mapping[str, int],
     generator: Generator,
     classes: Sequence[str],
     ground: float | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> TrainingFrame:
     """Ground-truth sampling of SECOND: inserts objects of other frames at their original positions.
 
-    labels (M,) int64 number the boxes' classes in `classes`; boxes of any other number only block their place. For each
-    class in `counts`, objects are drawn without replacement until the frame has that many of them.
+    The frame's labels number `classes`; boxes of any other number only block their place. For each class in `counts`,
+    objects are drawn without replacement until the frame has that many of them.
     """
     drawn: list[np.ndarray] = [np.empty(0, np.int64)]
     drawn_labels: list[int] = []
     for name, count in counts.items():
         label = classes.index(name)
-        missing = max(0, count - int((labels == label).sum()))
+        missing = max(0, count - int((frame.labels == label).sum()))
         known = objects.of_class.get(name, drawn[0])
         picked = torch.randperm(len(known), generator=generator)[:missing].numpy()
         drawn.append(known[picked])
         drawn_labels += [label] * len(picked)
-    return _insert(points, boxes, labels, objects, np.concatenate(drawn), drawn_labels, ground)
+    return _insert(frame, objects, np.concatenate(drawn), drawn_labels, ground)
 
 
 def sample_frame(
-    points: Tensor,
-    boxes: Tensor,
-    labels: Tensor,
+    frame: TrainingFrame,
     objects: ObjectSampler,
     generator: Generator,
     classes: Sequence[str],
     ground: float | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Inserts all objects of one frame of the database into points (N, 4), boxes (M, 7) and labels (M,).
+) -> TrainingFrame:
+    """Inserts all objects of one frame of the database.
 
     They keep their arrangement: a queue at a light, cars along a kerb. Those of other classes have label -1.
     """
     drawn = objects.of_frame[int(torch.randint(len(objects.of_frame), (), generator=generator))]
     drawn_labels = [classes.index(name) if name in classes else -1 for name in objects.database.name[drawn]]
-    return _insert(points, boxes, labels, objects, drawn, drawn_labels, ground)
+    return _insert(frame, objects, drawn, drawn_labels, ground)
 
 
 def _insert(
-    points: Tensor,
-    boxes: Tensor,
-    labels: Tensor,
+    frame: TrainingFrame,
     objects: ObjectSampler,
     drawn: np.ndarray,
     drawn_labels: Sequence[int],
     ground: float | None,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> TrainingFrame:
     """Inserts rows of the database, in this order, into a frame.
 
     An object that collides in bird's eye view with a box of the frame or with one inserted before is skipped, not
     replaced. Points of the frame inside an inserted box give way to the object's own. On a flat ground an object is
     raised or lowered to stand on it.
     """
-    drawn_boxes = torch.from_numpy(objects.database.box[drawn])
-    rise = torch.zeros(len(drawn))
-    if ground is not None:
-        rise = ground - (drawn_boxes[:, 2] - drawn_boxes[:, 5] / 2)
-        drawn_boxes = drawn_boxes.clone()
-        drawn_boxes[:, 2] += rise
-    collides = boxes_collide(drawn_boxes, torch.cat((boxes, drawn_boxes))).numpy()
-    standing = np.arange(len(boxes) + len(drawn)) < len(boxes)
-    for k in range(len(drawn)):
-        standing[len(boxes) + k] = not (collides[k] & standing).any()
-    inserted = np.flatnonzero(standing[len(boxes) :])
+    points, boxes, labels, device = frame.points, frame.boxes, frame.labels, frame.points.device
+    new_boxes = torch.from_numpy(objects.database.box[drawn])
+    inserted = _free_places(new_boxes, boxes)
     if len(inserted) == 0:
-        return points, boxes, labels
-    new_boxes = drawn_boxes[inserted]
-    points = drop(points, points_in_boxes(points, send(new_boxes, points.device)).any(dim=1))
+        return frame
+    new_boxes, new_labels = new_boxes[inserted], labels.new_tensor(drawn_labels)[inserted]
     offsets = objects.database.offsets
     parts = [objects.points[offsets[k] : offsets[k + 1]] for k in drawn[inserted]]
     new_points = torch.cat(parts)
+    of_object = torch.arange(len(parts)).repeat_interleave(torch.tensor([len(part) for part in parts]))
     if ground is not None:
-        new_points[:, 2] += send(
-            rise[inserted].repeat_interleave(torch.tensor([len(part) for part in parts])), points.device
-        )
-    return (
-        torch.cat((points, new_points)),
-        torch.cat((boxes, new_boxes)),
-        torch.cat((labels, labels.new_tensor(drawn_labels)[inserted])),
+        rise = ground - (new_boxes[:, 2] - new_boxes[:, 5] / 2)
+        new_boxes[:, 2] += rise
+        new_points[:, 2] += rise[of_object]
+    points = drop(points, points_in_boxes(points, send(new_boxes, device)).any(dim=1))
+    return frame._replace(
+        points=torch.cat((points, send(new_points, device))),
+        boxes=torch.cat((boxes, new_boxes)),
+        labels=torch.cat((labels, new_labels)),
     )
+
+
+def _free_places(new_boxes: Tensor, boxes: Tensor) -> np.ndarray:
+    """Which of new boxes (K, 7), ascending, collide neither with boxes (M, 7) nor with one of these before them."""
+    collides = boxes_collide(new_boxes, torch.cat((boxes, new_boxes))).numpy()
+    standing = np.arange(len(boxes) + len(new_boxes)) < len(boxes)
+    for k in range(len(new_boxes)):
+        standing[len(boxes) + k] = not (collides[k] & standing).any()
+    return np.flatnonzero(standing[len(boxes) :])

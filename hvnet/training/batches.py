@@ -21,7 +21,7 @@ from hvnet.data.drives import drive_weights, read_drives
 from hvnet.data.frame import Frame, Frames, check_names, frame_at, object_names
 from hvnet.data.ground import flatten
 from hvnet.data.gt_database import Database, build_database, load_database
-from hvnet.data.insert import ObjectSampler, send
+from hvnet.data.insert import ObjectSampler, TrainingFrame, send
 from hvnet.data.kitti import KittiFrames, read_split_frames
 from hvnet.data.scenes.files import generate
 from hvnet.data.scenes.street import Options
@@ -127,7 +127,7 @@ class TrainingFrames(Dataset[Sample | InputError]):
         self.frames, self.config, self.objects, self.device = frames, config, objects, device
         self.weights = drive_weights(drives)
         self.classes = [entry.name for entry in config.head.classes]
-        self.kept: dict[int, Sample] = {}
+        self.kept: dict[int, TrainingFrame] = {}
 
     def __getitem__(self, item: tuple[int, int]) -> Sample | InputError:
         try:
@@ -140,24 +140,21 @@ class TrainingFrames(Dataset[Sample | InputError]):
         options = self.config.augment
         generator = seeded(self.config.train.seed, epoch, k)
         frame = self.read(k % len(self.frames))
-        points, boxes, labels, note, name = frame
         if options.mix and torch.rand((), generator=generator).item() < options.mix:
             if len(self.weights):
                 drawn = torch.multinomial(self.weights, 1, generator=generator)
             else:
                 drawn = torch.randint(len(self.frames), (), generator=generator)
-            other = self.read(int(drawn))
-            points, boxes, labels = mix_sectors(points, boxes, labels, other[:3], generator)
-            note = "\n".join(filter(None, (note, other.note)))
+            frame = mix_sectors(frame, self.read(int(drawn)), generator)
         # inserted objects are too many, and stand where none would be: the last epochs see streets as they are
         faded = epoch >= self.config.train.epochs - options.fade_out
         objects = None if faded else self.objects
-        points, boxes, labels = augment(points, boxes, labels, objects, options, generator, self.classes, self.ground)
+        points, boxes, labels = augment(frame, objects, options, generator, self.classes, self.ground)
         low, high = boxes.new_tensor(self.config.encoder.point_range).view(2, 3)
         inside = ((boxes[:, :2] >= low[:2]) & (boxes[:, :2] < high[:2])).all(dim=1) & (labels >= 0)
-        return Sample(points, boxes[inside], labels[inside], note, name)
+        return Sample(points, boxes[inside], labels[inside], frame.note, frame.name)
 
-    def read(self, k: int) -> Sample:
+    def read(self, k: int) -> TrainingFrame:
         """Frame k as it is; boxes of classes that are not trained have label -1.
 
         Where frames that cannot be read are to be skipped, the next one that can be takes the place.
@@ -184,14 +181,14 @@ class TrainingFrames(Dataset[Sample | InputError]):
             self.kept[k] = sample
         return sample
 
-    def sample_of(self, frame: Frame, note: str) -> Sample:
+    def sample_of(self, frame: Frame, note: str) -> TrainingFrame:
         """The frame on the device, its classes by number."""
         assert frame.objects is not None
         labels = [self.classes.index(name) if name in self.classes else -1 for name in frame.objects.names]
         points, boxes = frame.points, frame.objects.boxes
         if self.ground is not None:
             points, boxes = flatten(points, boxes, self.ground, self.config.encoder.point_range)
-        return Sample(points.to(self.device), boxes, torch.tensor(labels).long(), note, frame.name)
+        return TrainingFrame(points.to(self.device), boxes, torch.tensor(labels).long(), note, frame.name)
 
 
 class EpochOrder(Sampler[list[tuple[int, int]]]):

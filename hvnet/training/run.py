@@ -169,7 +169,7 @@ class Run:
         place = self.device if config.train.workers == 0 else torch.device("cpu")
         objects = None
         if config.augment.objects or config.augment.whole_frames:
-            objects = sampler_of(training_objects(data, good, self.say), place)
+            objects = sampler_of(training_objects(data, good, self.say))
         ground = self.sensor["ground"] if config.encoder.flat_ground else None
         if config.encoder.flat_ground and ground is None:
             self.say("no ground is found in the clouds, so that slopes stay; data.sensor_height tells its height")
