@@ -106,6 +106,7 @@ class AugmentConfig:
     translation: tuple[float, float, float] = (0.2, 0.2, 0.2)  # standard deviations in metres
     objects: dict[str, int] = field(default_factory=dict)  # objects of a class after ground-truth sampling
     whole_frames: float = 0.0  # probability that all objects of one frame of the database are inserted instead
+    occlusion: bool = False  # inserted objects hide what is behind them, and are hidden by what is before them
     fade_out: int = 0  # last epochs of a run in which no object is inserted
     mix: float = 0.0  # probability that a sector of the frame is taken from another frame
     # frames as other sensors see them

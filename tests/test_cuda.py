@@ -26,6 +26,7 @@ from hvnet.data.augment import augment, mix_sectors
 from hvnet.data.gt_database import load_database
 from hvnet.data.insert import TrainingFrame, sampler_of
 from hvnet.data.kitti import read_split
+from hvnet.data.occlusion import nearest_points
 from hvnet.data.scenes.files import make_frame
 from hvnet.data.scenes.street import Options
 from hvnet.kernels import reference
@@ -453,16 +454,18 @@ def test_augmented_clouds(scenes: Path) -> None:
     names, classes = read_split(scenes, "train"), ("Car", "Pedestrian", "Cyclist")
     database = load_database(scenes, names, [])
     points, boxes = some_points(3000), random_boxes(4, 0, centre=6).float()
-    frame = TrainingFrame(points, boxes, torch.tensor([0, 1, 2, 0]))
+    frame = TrainingFrame(points, boxes, torch.tensor([0, 1, 2, 0]), nearest_points(points))
     points = some_points(2500, seed=1)
     boxes, labels = random_boxes(3, 1, centre=5).float(), torch.tensor([1, 0, 2])
-    other = TrainingFrame(points, boxes, labels)
+    other = TrainingFrame(points, boxes, labels, nearest_points(points))
     for seed in range(12):
         options = AugmentConfig(objects={"Car": 8, "Pedestrian": 4}, whole_frames=0.3)
         results = []
         for device in (CPU, GPU):
             generator = torch.Generator().manual_seed(seed)
             there = [each._replace(points=each.points.to(device)) for each in (frame, other)]
+            if seed % 3 == 0:
+                there = [each._replace(obstacles=None) for each in there]
             mixed = mix_sectors(*there, generator)
             results.append(
                 augment(mixed, sampler_of(database), options, generator, classes, -1.6 if seed % 2 else None)

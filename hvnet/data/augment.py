@@ -123,10 +123,15 @@ def mix_sectors(frame: TrainingFrame, other: TrainingFrame, generator: Generator
     # half of an object that is removed with the other side must not stay behind
     stays &= ~within(frame.points, frame.boxes[~kept]) | in_own
     comes &= ~within(other.points, other.boxes[~taken]) | from_new
+    obstacles = None
+    if frame.obstacles is not None and other.obstacles is not None:
+        own_obstacles, new_obstacles = on_own_side(frame.obstacles), ~on_own_side(other.obstacles)
+        obstacles = torch.cat((frame.obstacles[own_obstacles], other.obstacles[new_obstacles]))
     return TrainingFrame(
         torch.cat((drop(frame.points, ~stays), drop(other.points, ~comes))),
         torch.cat((own, new)),
         torch.cat((frame.labels[kept], other.labels[taken])),
+        obstacles,
         "\n".join(filter(None, (frame.note, other.note))),
         frame.name,
     )

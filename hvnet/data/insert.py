@@ -14,6 +14,7 @@ from torch import Generator, Tensor
 
 from hvnet.boxes import boxes_collide, points_in_boxes
 from hvnet.data.gt_database import Database, object_points
+from hvnet.data.occlusion import hidden, rays_to
 from hvnet.kernels.launch import many_threads
 
 MIN_POINTS = 5
@@ -26,6 +27,7 @@ class TrainingFrame(NamedTuple):
     points: Tensor  # (N, 4), on the GPU when training on one
     boxes: Tensor  # (M, 7)
     labels: Tensor  # (M,) int64, index into the config's classes, or -1
+    obstacles: Tensor | None = None  # (S, 3) of `nearest_points`, if inserted objects hide and are hidden
     note: str = ""
     name: str = ""
 
@@ -119,7 +121,9 @@ def _insert(
 
     An object that collides in bird's eye view with a box of the frame or with one inserted before is skipped, not
     replaced. Points of the frame inside an inserted box give way to the object's own. On a flat ground an object is
-    raised or lowered to stand on it.
+    raised or lowered to stand on it. Where obstacles are known, what the sensor would not see is taken out: points of
+    an object behind others or behind obstacles, points of the frame behind objects, and boxes of both that this leaves
+    few points.
     """
     points, boxes, labels, device = frame.points, frame.boxes, frame.labels, frame.points.device
     new_boxes = torch.from_numpy(objects.database.box[drawn])
@@ -135,7 +139,19 @@ def _insert(
         rise = ground - (new_boxes[:, 2] - new_boxes[:, 5] / 2)
         new_boxes[:, 2] += rise
         new_points[:, 2] += rise[of_object]
-    points = drop(points, points_in_boxes(points, send(new_boxes, device)).any(dim=1))
+    gone = torch.zeros((), dtype=torch.bool, device=device)
+    if frame.obstacles is not None:
+        rays, obstacles = rays_to(new_points), rays_to(frame.obstacles)
+        seen = ~hidden(rays, of_object, new_boxes[:, 2] - new_boxes[:, 5] / 2, obstacles)
+        stays = torch.bincount(of_object[seen], minlength=len(parts)) >= MIN_POINTS
+        seen &= stays[of_object]
+        new_boxes, new_labels, new_points = new_boxes[stays], new_labels[stays], new_points[seen]
+        image = rays.select(seen).image()
+        gone = rays_to(points).behind(send(image, device))
+        covered, of_box = obstacles.behind(image)[:, None], points_in_boxes(frame.obstacles, boxes)
+        stays = ((of_box & ~covered).sum(dim=0) >= MIN_POINTS) | ~(of_box & covered).any(dim=0)
+        boxes, labels = boxes[stays], labels[stays]
+    points = drop(points, gone | points_in_boxes(points, send(new_boxes, device)).any(dim=1))
     return frame._replace(
         points=torch.cat((points, send(new_points, device))),
         boxes=torch.cat((boxes, new_boxes)),

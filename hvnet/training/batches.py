@@ -23,6 +23,7 @@ from hvnet.data.ground import flatten
 from hvnet.data.gt_database import Database, build_database, load_database
 from hvnet.data.insert import ObjectSampler, TrainingFrame, send
 from hvnet.data.kitti import KittiFrames, read_split_frames
+from hvnet.data.occlusion import nearest_points
 from hvnet.data.scenes.files import generate
 from hvnet.data.scenes.street import Options
 from hvnet.data.sensor import (
@@ -188,7 +189,8 @@ class TrainingFrames(Dataset[Sample | InputError]):
         points, boxes = frame.points, frame.objects.boxes
         if self.ground is not None:
             points, boxes = flatten(points, boxes, self.ground, self.config.encoder.point_range)
-        return TrainingFrame(points.to(self.device), boxes, torch.tensor(labels).long(), note, frame.name)
+        obstacles = nearest_points(points) if self.config.augment.occlusion else None
+        return TrainingFrame(points.to(self.device), boxes, torch.tensor(labels).long(), obstacles, note, frame.name)
 
 
 class EpochOrder(Sampler[list[tuple[int, int]]]):
