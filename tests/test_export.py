@@ -20,6 +20,7 @@ from hvnet.exceptions import InputError
 from hvnet.export import main
 from hvnet.network.anchors import make_anchors
 from hvnet.network.checkpoint import find_checkpoint, load_checkpoint, model_from_checkpoint, save_checkpoint
+from hvnet.network.detector import Detector
 from hvnet.network.export import describe, map_names, maps_of_class, write_onnx, write_program
 from hvnet.network.head import HeadMaps
 from hvnet.network.model import Detections, HVNet
@@ -170,8 +171,8 @@ def test_the_onnx_file_is_standard_and_folded(exported: Path, shipped: HVNet) ->
     assert {node.domain for node in model.graph.node} == {""}
     kinds = [node.op_type for node in model.graph.node]
     assert "BatchNormalization" not in kinds
-    # blocks, the FFPN without the level that no class has, four branches of three heads
-    assert kinds.count("Conv") == (3 + 5 + 5) + (3 + 2) + 4 * 3
+    # blocks, the FFPN without the level that no class has, five branches of three heads
+    assert kinds.count("Conv") == (3 + 5 + 5) + (3 + 2) + 5 * 3
     meta = json.loads((exported / "meta.json").read_text())
     for image, given in zip(meta["images"], model.graph.input, strict=True):
         batch, *shape = given.type.tensor_type.shape.dim
@@ -199,7 +200,7 @@ def test_the_program_in_a_fresh_process(exported: Path, shipped: HVNet, scenes: 
     subprocess.run([sys.executable, "-c", code, *map(str, files)], cwd=ROOT, check=True)
     for points, found in zip(given, torch.load(tmp_path / "maps.pt"), strict=True):
         with torch.no_grad():
-            want = by_name(shipped, shipped(points, torch.zeros(len(points), dtype=torch.int64), 1))
+            want = by_name(shipped, shipped.maps(points, torch.zeros(len(points), dtype=torch.int64), 1))
         assert not any(value.requires_grad for value in found.values())
         assert_same_maps(found, want)
 
@@ -257,13 +258,14 @@ def test_the_documents_examples(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """They run as they stand and find what the plain model finds."""
+    """They run as they stand and find what the detector finds."""
     pytest.importorskip("onnxruntime", reason="onnxruntime is not installed: pip install '.[test]'")
-    points, sample = scene(scenes, 1)
+    points = scene(scenes, 1)[0]
     points.numpy().astype(np.float32).tofile(tmp_path / "cloud.bin")
     (tmp_path / "export").symlink_to(exported)
     monkeypatch.chdir(tmp_path)
-    want = shipped.detect(points, sample, 1)[0]
+    ground = load_checkpoint(find_checkpoint(None))["sensor"]["ground"]
+    want = Detector(shipped, torch.device("cpu"), torch.float32, ground=ground)(points)
     scope: dict[str, Any] = {}
     with_onnx, with_program = examples()
     for example in (with_onnx, with_program):
