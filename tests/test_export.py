@@ -94,7 +94,7 @@ def boxes_of_maps(model: HVNet, maps: dict[str, Tensor], monkeypatch: pytest.Mon
         for entry in config.head.classes
     ]
     with monkeypatch.context() as patch:
-        patch.setattr(model, "forward", lambda *_: of_classes)
+        patch.setattr(model, "maps", lambda *_: of_classes)
         return model.detect(torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), batch)
 
 
