@@ -13,8 +13,10 @@ from hvnet.network.checkpoint import save_checkpoint
 from hvnet.network.model import HVNet
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
-NARROW = ["encoder.point_range=[0, -3.2, -3, 12.8, 3.2, 2]"]  # not square: 32 x 16 cells at demo's finest scale
+COARSE = ["encoder.voxel_size=[0.4, 0.4]", "loss.beta=1.0"]
+NARROW = [*COARSE, "encoder.point_range=[0, -3.2, -3, 12.8, 3.2, 2]"]  # not square: 32 x 16 cells at the finest scale
 TINY = [
+    *COARSE,
     "encoder.point_range=[0, -6.4, -3, 25.6, 6.4, 2]",
     "encoder.feature_channels=4",
     "encoder.image_channels=8",
