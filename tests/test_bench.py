@@ -212,9 +212,9 @@ def test_report_of_what_a_gpu_would_do(tmp_path: Path) -> None:
         stages = {row["stage"]: row for row in tree[part]}
         assert len(stages) == len(tree[part])
         assert all(row["estimated_us"] >= row["floor_us"] >= 0 and row["launches"] > 0 for row in stages.values())
-        # of the paper's backbone; the training step has four clouds
+        # of the paper's backbone; the training step has four clouds, and boxes of positive anchors alone
         convolutions = stages["convolutions"]["flops"] / (4 if part == "training" else 1)
-        assert 130e9 < convolutions < 170e9
+        assert (125e9 if part == "training" else 130e9) < convolutions < 170e9
     outside = [row["stage"] for row in tree["frame"] if not row["in_graph"]]
     assert outside == ["upload", "transfer"]
     assert [row["holds"] for row in tree["bounds"]] == [

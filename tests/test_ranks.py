@@ -12,8 +12,7 @@ from hvnet import ranks
 from hvnet.config import Config, load_config
 from hvnet.network.model import HVNet
 from tests.helpers import ROOT
-
-NARROW = ["encoder.point_range=[0, -3.2, -3, 12.8, 3.2, 2]"]
+from tests.models import NARROW
 
 
 def small() -> Config:

@@ -7,6 +7,7 @@ from hvnet.config import load_config
 from hvnet.training.batches import kitti_data
 from hvnet.training.run import Run
 from tests.helpers import ROOT
+from tests.models import COARSE
 
 FRAMES = ["000157", "000010", "000114", "000217"]  # 28 cars, 16 of them moderate, all within 43 m
 
@@ -22,7 +23,7 @@ def test_four_real_frames_are_learnt_by_heart(kitti_root: Path, tmp_path: Path) 
     schedule = ["epochs=60", "learning_rate=5.0e-3", "warmup_steps=10", "decay_epochs=[45, 55]", "pictures=0"]
     config = load_config(
         ROOT / "configs" / "demo.yaml",
-        ["encoder.point_range=[0, -19.2, -3, 44.8, 19.2, 2]"]
+        [*COARSE, "encoder.point_range=[0, -19.2, -3, 44.8, 19.2, 2]"]
         + [f"augment.{change}" for change in plain]
         + [f"train.{change}" for change in [*schedule, "validate_every=60"]],
     )
