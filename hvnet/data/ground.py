@@ -28,7 +28,11 @@ LARGEST = 0.6
 """Metres between the plane and the ground at most."""
 REACH = 3.0
 """Metres around a place in which cells say how high it is there."""
+ALONE = 0.05
+"""Weight of the plane itself, where cells are far."""
 ITERATIONS = 5
+"""Fits of the plane, each with the weights that the one before gives. With five, labelled cars stand as near to the
+ground as with twelve; on one of 53 frames, tilted by 1.2 %, five were too few."""
 
 
 def ground_map(points: Tensor, reach: float) -> Tensor:
@@ -61,7 +65,7 @@ def ground_map(points: Tensor, reach: float) -> Tensor:
     near = torch.exp(-(centre[:, None] - centre).square() / (2 * REACH**2))
     both = torch.stack((weight, weight * left.nan_to_num(0.0))).unflatten(2, (side, side))
     weight, weighed = (near @ both @ near).unbind(0)
-    ground = (plane @ rows.T).unflatten(1, (side, side)) + weighed / (weight + 0.05)
+    ground = (plane @ rows.T).unflatten(1, (side, side)) + weighed / (weight + ALONE)
     return ground.where(found[:, None, None], math.nan).float()
 
 

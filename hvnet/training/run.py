@@ -170,11 +170,12 @@ class Run:
         objects = None
         if config.augment.objects or config.augment.whole_frames:
             objects = sampler_of(training_objects(data, good, self.say))
-        ground = self.sensor["ground"] if config.encoder.flat_ground else None
-        if config.encoder.flat_ground and ground is None:
+        # the height that the ground of every cloud is brought to; None: clouds stay as they are
+        self.flat_ground = self.sensor["ground"] if config.encoder.flat_ground else None
+        if config.encoder.flat_ground and self.flat_ground is None:
             self.say("no ground is found in the clouds, so that slopes stay; data.sensor_height tells its height")
         return DataLoader(
-            TrainingFrames(data.train, config, objects, place, data.drives, ground),
+            TrainingFrames(data.train, config, objects, place, data.drives, self.flat_ground),
             batch_sampler=order,
             collate_fn=collate,
             generator=torch.Generator(),  # otherwise every new epoch would draw from torch's global generator
@@ -328,8 +329,7 @@ class Run:
 
     def validate(self) -> dict[str, dict[str, Any]]:
         """Detects in the validation frames, scores the boxes by KITTI's protocol and draws the first few frames."""
-        ground = self.sensor["ground"] if self.config.encoder.flat_ground else None
-        detector = Detector(self.averaged or self.model, self.device, ground=ground)
+        detector = Detector(self.averaged or self.model, self.device, ground=self.flat_ground)
         classes, point_range = detector.classes, self.config.encoder.point_range
 
         def draw(detected: Detected) -> None:
