@@ -37,8 +37,8 @@ class AnchorTable(NamedTuple):
 def write_keys(logits: Tensor, iou: Tensor | None, threshold: float, label: int, keys: Tensor) -> None:
     """Writes the keys of the A anchors of a class to keys (B, C, A' >= A) int64; negative where there is no candidate.
 
-    logits, iou: (B, A), of float32, float16 or bfloat16; the score is the product of their sigmoids. It has to be above
-    the threshold, which is not negative; NaN is not.
+    logits, iou: (B, A), of float32, float16 or bfloat16; the score is the geometric mean of their sigmoids. It has
+    to be above the threshold, which is not negative; NaN is not.
     """
     other = logits if iou is None else iou
     inputs = [array(logits), array(other), int(iou is not None), threshold, label, array(keys)]
@@ -97,7 +97,7 @@ def _kernels(map_dtype: Any) -> SimpleNamespace:
         if a < logits.shape[1]:
             score = _sigmoid(float(logits[b, a]))
             if has_iou != 0:
-                score *= _sigmoid(float(iou[b, a]))
+                score = wp.sqrt(score * _sigmoid(float(iou[b, a])))
             if score > threshold:  # and so above 0: the order of its bits is that of its value
                 key = (wp.int64(wp.cast(score, wp.int32)) << wp.int64(32)) | wp.int64(LARGEST - a)
         keys[b, label, a] = key

@@ -18,6 +18,13 @@ from tests.models import CONFIGS, NARROW
 LARGEST = 2**31 - 1
 
 
+def test_scores() -> None:
+    """The geometric mean keeps the scale: half sure of both is half sure."""
+    logits, iou = torch.tensor([0.0, 0.0, math.log(4.0)]), torch.tensor([0.0, 40.0, math.log(0.25)])
+    torch.testing.assert_close(scores_of(logits, None), torch.tensor([0.5, 0.5, 0.8]))
+    torch.testing.assert_close(scores_of(logits, iou), torch.tensor([0.5, math.sqrt(0.5), 0.4]))
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.bfloat16])
 @pytest.mark.parametrize("has_iou", [False, True])
 def test_keys(has_iou: bool, dtype: torch.dtype, device: torch.device) -> None:
@@ -25,7 +32,7 @@ def test_keys(has_iou: bool, dtype: torch.dtype, device: torch.device) -> None:
     generator = torch.Generator().manual_seed(0)
     logits, iou = (torch.randn(2, 300, generator=generator).mul(3).to(dtype) for _ in range(2))
     logits[0, :4] = torch.tensor([0.0, math.nan, math.inf, -math.inf])
-    iou[0, :4] = 40.0
+    iou[0, :4] = torch.tensor([0.0, 40.0, 40.0, 40.0])
     threshold = 0.5
     keys = torch.full((2, 3, 320), 7, dtype=torch.int64, device=device)
     write_keys(logits.to(device), iou.to(device) if has_iou else None, threshold, 1, keys)
