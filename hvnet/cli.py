@@ -11,8 +11,9 @@ from typing import Any, Literal
 
 from hvnet.config import DataConfig
 from hvnet.data.columns import parse_columns
+from hvnet.data.drives import read_drives
 from hvnet.data.labels import class_map
-from hvnet.evaluation.bootstrap import CONFIDENCE, MIN_RESAMPLES, Resampling, read_groups, resample
+from hvnet.evaluation.bootstrap import CONFIDENCE, MIN_RESAMPLES, Resampling, resample
 from hvnet.exceptions import InputError, Stopped
 
 MAX_SENSOR_HEIGHT = 1000.0  # metres; below 0 where heights are those of a map
@@ -212,7 +213,7 @@ def read_bootstrap(options: argparse.Namespace, frames: Sequence[str]) -> Resamp
         raise InputError(f"--seed {seed}: want 0 or more")
     if not frames:
         raise InputError(f"--bootstrap {count}: no frame has labels, so nothing is scored; leave it out")
-    return resample(count, frames if groups is None else read_groups(groups, frames), seed=seed)
+    return resample(count, frames if groups is None else read_drives(groups, frames), seed=seed)
 
 
 def add_changes(parser: argparse.ArgumentParser, what: str) -> None:

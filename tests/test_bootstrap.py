@@ -1,17 +1,15 @@
 """Intervals of figures: hand-made frames, and resamples against frames that are given several times."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hvnet.evaluation.bootstrap import Resampling, differences, interval, read_groups, resample
+from hvnet.evaluation.bootstrap import Resampling, differences, interval, resample
 from hvnet.evaluation.matching import distance_levels
 from hvnet.evaluation.precision import MEASURES, evaluate
 from hvnet.evaluation.rules import Rule
 from hvnet.evaluation.tables import format_differences, format_table
-from hvnet.exceptions import InputError
 from tests.helpers import crowd, rows
 from tests.test_matching import random_frame
 
@@ -134,28 +132,3 @@ def test_table_with_intervals() -> None:
 def test_frames_of_another_number() -> None:
     with pytest.raises(ValueError, match="resampling: want 2 frames, as there are labels, got 1"):
         evaluate([rows(CAR)] * 2, [rows(CAR, scored=True)] * 2, resampling=drawn([1]))
-
-
-def test_groups_of_a_file(tmp_path: Path) -> None:
-    file = tmp_path / "drives.csv"
-    file.write_text("\ufeffindex,drive,frame\n7,b,000001\n8,a, 000002\n9,b,000003\n", encoding="utf-8")
-    assert read_groups(file, ["000003", "000002", "000001"]) == ["b", "a", "b"]
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("frame,drive\n000001,a\n", r"drives\.csv: no line for frame 000002; add it with its drive, or leave"),
-        ("frame,street\n000001,a\n", r"drives\.csv: no column drive; let its first line name frame and drive"),
-        ("", r"drives\.csv: no column frame"),
-        ("frame,drive\n000001,a\n000002\n", r"drives\.csv:3: want a frame and its drive"),
-        ("frame,drive\n000001,a\n000001,b\n", r"drives\.csv:3: frame 000001 is already in drive a; remove one"),
-        ("frame,drive\n000001,\xe4\n", r"drives\.csv: cannot be read as CSV"),
-    ],
-)
-def test_wrong_files_of_groups(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "drives.csv").write_text(text, encoding="latin-1")
-    with pytest.raises(InputError, match=message):
-        read_groups(tmp_path / "drives.csv", ["000001", "000002"])
-    with pytest.raises(InputError, match=r"none\.csv: cannot be read"):
-        read_groups(tmp_path / "none.csv", [])

@@ -12,7 +12,14 @@ from hvnet.exceptions import InputError
 
 def test_drives_are_read_by_name(tmp_path: Path) -> None:
     path = tmp_path / "drives.csv"
-    path.write_bytes(b'\xef\xbb\xbfindex,drive,frame\r\n7,street,000003\r\n0,"a, b",000001\r\n1,other,000002\r\n')
+    lines = [
+        b"\xef\xbb\xbfindex,drive,frame",
+        b"7,street, 000003",
+        b'0,"a, b",000001',
+        b"1,other,000002",
+        b"7,street,000003",
+    ]
+    path.write_bytes(b"\r\n".join(lines))
     assert read_drives(path, ["000001", "000003"]) == ["a, b", "street"]
     assert read_drives(path, []) == []
 
@@ -20,12 +27,14 @@ def test_drives_are_read_by_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "drives.csv: no such file; it holds the drive of each frame, in columns frame,drive"),
-        ("", "drives.csv:1: has no column drive; the first line is to be frame,drive"),
+        (None, "drives.csv: cannot be read ("),
+        ("", "drives.csv:1: has no column frame; the first line is to be frame,drive"),
         ("drive,index\n", "drives.csv:1: has no column frame; "),
+        ("frame,street\n1,a\n", "drives.csv:1: has no column drive; "),
         ("frame,drive\n1,a\n", "drives.csv: has no drive for 1 of 2 frames, such as 2; add a line for each"),
-        ("frame,drive\n1\n2,a\n", "drives.csv: has no drive for 1 of 2 frames, such as 1; "),
-        ("frame,drive\n1,a\n2,a\n1,b\n", "drives.csv:4: frame 1 is listed twice; remove a line"),
+        ("frame,drive\n1\n2,a\n", "drives.csv:2: want a frame and its drive; complete or remove the line"),
+        ("frame,drive\n,a\n", "drives.csv:2: want a frame and its drive; "),
+        ("frame,drive\n1,a\n2,a\n1,b\n", "drives.csv:4: frame 1 is already in drive a; remove one"),
         (b"frame,drive\n1,\xff\n", "drives.csv: cannot be read ("),
     ],
 )

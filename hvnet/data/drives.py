@@ -14,24 +14,26 @@ from hvnet.exceptions import InputError
 def read_drives(path: Path, names: Sequence[str]) -> list[str]:
     """The drive of each of the named frames, from a CSV file with the columns `frame` and `drive`; others are ignored.
 
-    Raises InputError if the file has not these columns, or not each frame once.
+    Raises InputError if the file has not these columns, a line is incomplete, a named frame is absent, or a frame is in
+    two drives.
     """
+    drives: dict[str, str] = {}
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = csv.DictReader(file, restval="")
-            missing = {"frame", "drive"} - set(rows.fieldnames or ())
-            if missing:
-                raise InputError(f"{path}:1: has no column {min(missing)}; the first line is to be frame,drive")
-            drives: dict[str, str] = {}
+            rows = csv.DictReader(file)
+            for column in ("frame", "drive"):
+                if column not in (rows.fieldnames or ()):
+                    raise InputError(f"{path}:1: has no column {column}; the first line is to be frame,drive")
             for row in rows:
-                if row["frame"] in drives:
-                    raise InputError(f"{path}:{rows.line_num}: frame {row['frame']} is listed twice; remove a line")
-                drives[row["frame"]] = row["drive"]
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; it holds the drive of each frame, in columns frame,drive") from error
+                frame, drive = ((row[column] or "").strip() for column in ("frame", "drive"))
+                line = f"{path}:{rows.line_num}"
+                if not frame or not drive:
+                    raise InputError(f"{line}: want a frame and its drive; complete or remove the line")
+                if drives.setdefault(frame, drive) != drive:
+                    raise InputError(f"{line}: frame {frame} is already in drive {drives[frame]}; remove one")
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read ({error}); give a CSV file with the columns frame,drive") from error
-    unknown = [name for name in names if not drives.get(name)]
+    unknown = [name for name in names if name not in drives]
     if unknown:
         raise InputError(
             f"{path}: has no drive for {len(unknown)} of {len(names)} frames, such as {unknown[0]}; add a line for each"

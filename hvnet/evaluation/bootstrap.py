@@ -4,15 +4,12 @@ A resample draws as many groups as there are, with replacement; AP of many resam
 (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 13).
 """
 
-import csv
 from collections.abc import Hashable, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from hvnet.evaluation.matching import Floats, Integers
-from hvnet.exceptions import InputError
 
 CONFIDENCE = 95
 """Of an interval, in per cent."""
@@ -75,30 +72,3 @@ def differences(
                 if key in figures_b
             }
     return found
-
-
-def read_groups(path: Path, frames: Sequence[str]) -> list[str]:
-    """The groups of frames of a CSV file with the columns frame and drive, such as "000001,2011_09_26_drive_0101".
-
-    Raises InputError for a frame that the file does not have, or has in two drives.
-    """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            table = csv.DictReader(file)
-            missing = [column for column in ("frame", "drive") if column not in (table.fieldnames or ())]
-            if missing:
-                raise InputError(f"{path}: no column {missing[0]}; let its first line name frame and drive")
-            groups: dict[str, str] = {}
-            for row in table:
-                frame, drive = ((row[column] or "").strip() for column in ("frame", "drive"))
-                line = f"{path}:{table.line_num}"
-                if not frame or not drive:
-                    raise InputError(f"{line}: want a frame and its drive; complete or remove the line")
-                if groups.setdefault(frame, drive) != drive:
-                    raise InputError(f"{line}: frame {frame} is already in drive {groups[frame]}; remove one")
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read as CSV; it names frames and their drives") from error
-    for frame in frames:
-        if frame not in groups:
-            raise InputError(f"{path}: no line for frame {frame}; add it with its drive, or leave the frame out")
-    return [groups[frame] for frame in frames]

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from hvnet.config import Config, SyntheticConfig, load_config
+from hvnet.data.drives import read_drives
 from hvnet.data.frame import object_names
 from hvnet.data.kitti import read_split_frames
-from hvnet.evaluation.bootstrap import read_groups
 from hvnet.evaluation.rules import config_rules
 from hvnet.evaluation.scoring import background_note
 from hvnet.exceptions import InputError, Stopped
@@ -236,7 +236,7 @@ def run_study(name: str, options: Options) -> None:
     real = None
     if options.validate:
         frames = read_split_frames(options.validate, first.train.val_split, first.data)
-        real = RealFrames(frames, read_groups(options.groups, frames.names) if options.groups else frames.names)
+        real = RealFrames(frames, read_drives(options.groups, frames.names) if options.groups else frames.names)
     outcomes: list[Outcome] = []
     if name == "speed":
         times, lines = time_rows({row: configs[row] for row in options.rows or configs}, data, device)
