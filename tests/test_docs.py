@@ -111,6 +111,8 @@ def shortened(module: str, arguments: list[str], out: str) -> list[str]:
         return [*arguments, "--out", out]
     if module == "data.database":
         return [*arguments, "--out", f"{out}.npz"]
+    if module == "mistakes" and "--help" not in arguments:
+        return [*arguments, "--count", "3"]
     return arguments
 
 
