@@ -34,7 +34,7 @@ def test_drives_are_read_by_name(tmp_path: Path) -> None:
         ("frame,drive\n1,a\n", "drives.csv: has no drive for 1 of 2 frames, such as 2; add a line for each"),
         ("frame,drive\n1\n2,a\n", "drives.csv:2: want a frame and its drive; complete or remove the line"),
         ("frame,drive\n,a\n", "drives.csv:2: want a frame and its drive; "),
-        ("frame,drive\n1,a\n2,a\n1,b\n", "drives.csv:4: frame 1 is already in drive a; remove one"),
+        ("frame,drive\n1,a\n2,a\n1,b\n", "drives.csv:4: frame 1 is already in drive a; remove a line"),
         (b"frame,drive\n1,\xff\n", "drives.csv: cannot be read ("),
     ],
 )

@@ -12,7 +12,7 @@ from hvnet.exceptions import InputError
 
 
 def read_drives(path: Path, names: Sequence[str]) -> list[str]:
-    """The drive of each of the named frames, from a CSV file with the columns `frame` and `drive`; others are ignored.
+    """The drive of each of the named frames, from a CSV file with the columns `frame` and `drive`.
 
     Raises InputError if the file has not these columns, a line is incomplete, a named frame is absent, or a frame is in
     two drives.
@@ -30,7 +30,7 @@ def read_drives(path: Path, names: Sequence[str]) -> list[str]:
                 if not frame or not drive:
                     raise InputError(f"{line}: want a frame and its drive; complete or remove the line")
                 if drives.setdefault(frame, drive) != drive:
-                    raise InputError(f"{line}: frame {frame} is already in drive {drives[frame]}; remove one")
+                    raise InputError(f"{line}: frame {frame} is already in drive {drives[frame]}; remove a line")
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read ({error}); give a CSV file with the columns frame,drive") from error
     unknown = [name for name in names if name not in drives]
