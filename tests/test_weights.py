@@ -65,7 +65,7 @@ def test_cars_are_found_in_real_frames(kitti_root: Path) -> None:
         labelled = every.select(every.name != "DontCare")
         assert frame.objects is not None
         cars = frame.objects.boxes[(labelled.name == "Car") & (labelled.occlusion <= 1)]
-        mine = boxes[(labels == 0) & (scores > 0.3)]
+        mine = boxes[(labels == 0) & (scores > 0.5)]
         seen += len(cars)
         found += int((rotated_iou_bev(cars, mine).amax(1, keepdim=True) > 0.5).sum()) if len(mine) else 0
     assert seen > 10
