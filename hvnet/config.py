@@ -76,7 +76,7 @@ class HeadConfig:
     classes: tuple[ClassConfig, ...]
     regression: Literal["corners", "pose"] = "corners"  # of the BEV box: its corners, or x, y, l, w and theta
     direction: bool = False  # the two-bin heading branch
-    iou: bool = False  # a branch that predicts the box's IoU: the score is the geometric mean of both
+    iou: bool = False  # predicts the box's IoU: the score is the geometric mean of this and the class's
     score_threshold: float = 0.2
     candidates: int = 1000  # highest-scoring anchors of a class that go into NMS
     detections: int = 100  # maximum number of boxes reported per class

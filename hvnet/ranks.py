@@ -89,9 +89,9 @@ class BatchNorm2d(nn.BatchNorm2d):
         # for its statistics alone: torch.var_mean is much slower on a CPU
         nn.functional.batch_norm(wide.detach(), mean, variance, training=True, momentum=1.0)
         own = torch.stack((torch.full_like(mean, wide[:, 0].numel()), mean, variance))
-        of_ranks = [torch.empty_like(own) for _ in range(size())]
-        dist.all_gather(of_ranks, own)
-        counts, means, variances = torch.stack(of_ranks, dim=1)  # (ranks, C) each
+        gathered = [torch.empty_like(own) for _ in range(size())]
+        dist.all_gather(gathered, own)
+        counts, means, variances = torch.stack(gathered, dim=1)  # (ranks, C) each
         count = counts.sum(dim=0)
         joint = (counts * means).sum(dim=0) / count
         squares = ((counts - 1) * variances + counts * (means - joint).square()).sum(dim=0)
@@ -104,34 +104,47 @@ class BatchNorm2d(nn.BatchNorm2d):
 
 
 class _Normalise(torch.autograd.Function):
-    """A batch norm by the statistics of all ranks, by torch's own kernels; backward, sums are exchanged once."""
+    """Features (B, C, H, W) float32 normalised by the statistics (C,) of all ranks, by torch's own kernels.
+
+    The backward pass exchanges the sums of all ranks once.
+    """
 
     @staticmethod
     def forward(
-        ctx: Any, rows: Tensor, weight: Tensor, bias: Tensor, mean: Tensor, variance: Tensor, count: Tensor, eps: float
+        ctx: Any,
+        features: Tensor,
+        weight: Tensor,
+        bias: Tensor,
+        mean: Tensor,
+        variance: Tensor,
+        count: Tensor,
+        eps: float,
     ) -> Tensor:
-        ctx.save_for_backward(rows, weight, mean, variance, count)
+        ctx.save_for_backward(features, weight, mean, variance, count)
         ctx.eps = eps
-        return nn.functional.batch_norm(rows, mean, variance, weight, bias, eps=eps)
+        return nn.functional.batch_norm(features, mean, variance, weight, bias, eps=eps)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        rows, weight, mean, variance, count = ctx.saved_tensors
+        features, weight, mean, variance, count = ctx.saved_tensors
         scale = torch.rsqrt(variance + ctx.eps)
-        _, of_weight, of_bias = torch.ops.aten.native_batch_norm_backward(
-            grads[0], rows, weight, mean, variance, mean, scale, False, ctx.eps, [False, True, True]
+        _, grad_weight, grad_bias = torch.ops.aten.native_batch_norm_backward(
+            grads[0], features, weight, mean, variance, mean, scale, False, ctx.eps, [False, True, True]
         )
-        total = torch.stack((of_weight, of_bias))
+        total = torch.stack((grad_weight, grad_bias))
         dist.all_reduce(total)
-        of_weight_joint, of_bias_joint = total / count
-        # weight * scale * (grad - mean of grads - x^ * mean of grads times x^), with x^ = (x - mean) * scale
-        by_grad = weight * scale
-        by_row = -by_grad * scale * of_weight_joint
-        rest = -by_grad * of_bias_joint - by_row * mean
-        by_grad, by_row, rest = (each[:, None, None] for each in (by_grad, by_row, rest))
-        of_rows = torch.addcmul(rest, rows, by_row).addcmul_(grads[0], by_grad)
-        return of_rows, of_weight, of_bias, None, None, None, None
+        mean_of_products, mean_of_grads = total / count
+        # weight * scale * (grad - mean_of_grads - x^ * mean_of_products), with x^ = (x - mean) * scale;
+        # the products are grad * x^
+        grad_factor = weight * scale
+        feature_factor = -grad_factor * scale * mean_of_products
+        constant = -grad_factor * mean_of_grads - feature_factor * mean
+        grad_factor, feature_factor, constant = (
+            each[:, None, None] for each in (grad_factor, feature_factor, constant)
+        )
+        grad_input = torch.addcmul(constant, features, feature_factor).addcmul_(grads[0], grad_factor)
+        return grad_input, grad_weight, grad_bias, None, None, None, None
 
 
 def wrap_ddp(model: nn.Module) -> nn.Module:

@@ -116,9 +116,9 @@ def regress(level: Tensor, chosen: Tensor, weight: Tensor, anchors: int) -> Tens
 
 
 def scores_of(logits: Tensor, iou: Tensor | None) -> Tensor:
-    """Scores in [0, 1] of the logits of a class; where the IoU is predicted, the geometric mean of both.
+    """Scores in [0, 1] of the logits of a class; with a predicted IoU, the geometric mean of both sigmoids.
 
-    The order is that of their product (supplement, Sec. 2), whose scale would be another: 0.7 times 0.7 is 0.49.
+    The product (supplement, Sec. 2) ranks the same but lowers scores: 0.7 times 0.7 is 0.49.
     """
     return logits.sigmoid() if iou is None else (logits.sigmoid() * iou.sigmoid()).sqrt()
 
