@@ -128,7 +128,11 @@ def test_a_mirrored_cloud_gives_the_mirrored_boxes(street: Tensor) -> None:
 
 @both_ways
 def test_the_same_cars_are_found(street: Tensor) -> None:
-    """Turned, at another height, all round and with others, too; each object once."""
+    """Turned, at another height, all round and with others, too; each object once.
+
+    Found means an overlap of 0.5, as on the clouds of other sensors: turned by 10 degrees, a car that the
+    sensor sees from beside, at 4 m, has another length.
+    """
     want = hvnet.load(device="cpu")(street)
     sure = want.select((want.scores > 0.5) & (want.labels == 0))
     assert len(sure.boxes) >= 3
@@ -142,7 +146,7 @@ def test_the_same_cars_are_found(street: Tensor) -> None:
         for found, height in ((low, 0.0), (high, 1.33)):
             cars = found.select(found.labels == 0)
             iou = rotated_iou_bev(sure.boxes, cars.boxes)
-            assert (iou.amax(dim=1) > 0.6).all()
+            assert (iou.amax(dim=1) > 0.5).all()
             own = cars.boxes[iou.argmax(dim=1)]
             torch.testing.assert_close(own[:, 2], sure.boxes[:, 2] + height, rtol=0, atol=0.3)
             iou = rotated_iou_bev(cars.boxes, cars.boxes).fill_diagonal_(0)
