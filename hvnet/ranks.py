@@ -95,10 +95,10 @@ class BatchNorm2d(nn.BatchNorm2d):
         count = counts.sum(dim=0)
         joint = (counts * means).sum(dim=0) / count
         squares = ((counts - 1) * variances + counts * (means - joint).square()).sum(dim=0)
-        momentum = self.momentum or 0.1
+        batches = self.get_buffer("num_batches_tracked").add_(1)
+        momentum = 1 / batches if self.momentum is None else self.momentum  # None: the mean of all batches
         self.get_buffer("running_mean").lerp_(joint, momentum)
         self.get_buffer("running_var").lerp_(squares / (count - 1), momentum)
-        self.get_buffer("num_batches_tracked").add_(1)
         out: Tensor = _Normalise.apply(wide, self.weight, self.bias, joint, squares / count, count, self.eps)
         return out.to(features.dtype)
 
