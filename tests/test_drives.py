@@ -27,7 +27,7 @@ def test_drives_are_read_by_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "drives.csv: cannot be read ("),
+        (None, "drives.csv: no such file; give a CSV file with the columns frame,drive"),
         ("", "drives.csv:1: has no column frame; the first line is to be frame,drive"),
         ("drive,index\n", "drives.csv:1: has no column frame; "),
         ("frame,street\n1,a\n", "drives.csv:1: has no column drive; "),
@@ -35,7 +35,7 @@ def test_drives_are_read_by_name(tmp_path: Path) -> None:
         ("frame,drive\n1\n2,a\n", "drives.csv:2: want a frame and its drive; complete or remove the line"),
         ("frame,drive\n,a\n", "drives.csv:2: want a frame and its drive; "),
         ("frame,drive\n1,a\n2,a\n1,b\n", "drives.csv:4: frame 1 is already in drive a; remove a line"),
-        (b"frame,drive\n1,\xff\n", "drives.csv: cannot be read ("),
+        (b"frame,drive\n1,\xff\n", "drives.csv: cannot be read ('utf-8' codec"),
     ],
 )
 def test_mistakes(tmp_path: Path, text: str | bytes | None, message: str) -> None:
@@ -44,6 +44,11 @@ def test_mistakes(tmp_path: Path, text: str | bytes | None, message: str) -> Non
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(InputError, match=re.escape(message)):
         read_drives(path, ["1", "2"])
+
+
+def test_a_folder_in_its_place(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=re.escape(f"{tmp_path}: cannot be read (Is a directory)")):
+        read_drives(tmp_path, [])
 
 
 def test_weights() -> None:

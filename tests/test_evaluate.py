@@ -344,7 +344,8 @@ def test_intervals(folders: list[str], tmp_path: Path, capsys: pytest.CaptureFix
         (["--groups", "drives.csv"], r"--groups drives\.csv: is for --bootstrap N; add it"),
         (["--against", "other"], "--against other: is for --bootstrap N; add it"),
         (["--bootstrap", "100", "--against", "other"], "other: no such folder"),
-        (["--bootstrap", "100", "--groups", "none.csv"], r"none\.csv: cannot be read"),
+        (["--bootstrap", "100", "--groups", "none.csv"], r"^none\.csv: no such file; give a CSV file with the columns"),
+        (["--bootstrap", "100", "--groups", "."], r"^\.: cannot be read \(Is a directory\)$"),
     ],
 )
 def test_bad_options_of_intervals(folders: list[str], options: list[str], message: str) -> None:

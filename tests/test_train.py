@@ -216,7 +216,10 @@ def test_drives(copied: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="was trained on other frames or drives"):
         run(copied, tmp_path / "out", *changes, resume=True)
     file.unlink()
-    with pytest.raises(InputError, match=r"drives\.csv: cannot be read"):
+    with pytest.raises(InputError, match=r"drives\.csv: no such file; give a CSV file with the columns frame,drive"):
+        run(copied, tmp_path / "none", *changes)
+    file.mkdir()
+    with pytest.raises(InputError, match=r"drives\.csv: cannot be read \(Is a directory\)"):
         run(copied, tmp_path / "none", *changes)
     assert not (tmp_path / "none").exists()
 

@@ -14,10 +14,11 @@ from hvnet.exceptions import InputError
 def read_drives(path: Path, names: Sequence[str]) -> list[str]:
     """The drive of each of the named frames, from a CSV file with the columns `frame` and `drive`.
 
-    Raises InputError if the file has not these columns, a line is incomplete, a named frame is absent, or a frame is in
-    two drives.
+    Raises InputError if the file is missing or has not these columns, a line is incomplete, a named frame is absent, or
+    a frame is in two drives.
     """
     drives: dict[str, str] = {}
+    remedy = "give a CSV file with the columns frame,drive"
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = csv.DictReader(file)
@@ -31,8 +32,12 @@ def read_drives(path: Path, names: Sequence[str]) -> list[str]:
                     raise InputError(f"{line}: want a frame and its drive; complete or remove the line")
                 if drives.setdefault(frame, drive) != drive:
                     raise InputError(f"{line}: frame {frame} is already in drive {drives[frame]}; remove a line")
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read ({error}); give a CSV file with the columns frame,drive") from error
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file; {remedy}") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read ({error}); {remedy}") from error
     unknown = [name for name in names if name not in drives]
     if unknown:
         raise InputError(
