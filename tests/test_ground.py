@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from hvnet.data import ground
 from hvnet.data.ground import CELL, FEWEST, FEWEST_CELLS, cells_of, flatten, ground_map, heights_at, reach_of, solve
 from hvnet.data.kitti import read_frame, read_split
 
@@ -92,8 +93,8 @@ def test_points_that_are_not_finite_are_ignored() -> None:
 
 
 def test_places_beyond_the_map_have_the_height_of_its_border() -> None:
-    ground = torch.arange(16.0).view(1, 4, 4)
-    assert heights_at(ground, torch.tensor([[[-9.0, -9.0], [9.0, 9.0], [0.0, 0.0], [1.0, -3.0]]])).tolist() == [
+    heights = torch.arange(16.0).view(1, 4, 4)
+    assert heights_at(heights, torch.tensor([[[-9.0, -9.0], [9.0, 9.0], [0.0, 0.0], [1.0, -3.0]]])).tolist() == [
         [0, 15, 7.5, 8]
     ]
 
@@ -120,15 +121,32 @@ def test_a_flattened_frame() -> None:
         assert torch.equal(before, after)
 
 
-def test_labelled_boxes_of_real_frames_stand_on_it(kitti_root: Path) -> None:
+@pytest.fixture(scope="module")
+def real_frames(kitti_root: Path) -> list[tuple[Tensor, Tensor]]:
+    """Points (N, 4) and labelled boxes (M, 7) of the frames to validate."""
+    frames = [read_frame(kitti_root, name) for name in read_split(kitti_root, "val")]
+    return [(frame.points, frame.objects.boxes) for frame in frames if frame.objects is not None]
+
+
+def test_labelled_boxes_of_real_frames_stand_on_it(real_frames: list[tuple[Tensor, Tensor]]) -> None:
     """Half of them within 6 cm, nine of ten within 20 cm."""
-    left = []
-    for name in read_split(kitti_root, "val"):
-        frame = read_frame(kitti_root, name)
-        assert frame.objects is not None
-        boxes = frame.objects.boxes
-        left.append((boxes[:, 2] - boxes[:, 5] / 2 - ground_at(frame.points, boxes[:, :2])).abs())
-    every = torch.cat(left)
+    bottoms = [boxes[:, 2] - boxes[:, 5] / 2 for _, boxes in real_frames]
+    left = [bottom - ground_at(points, boxes[:, :2])
+            for bottom, (points, boxes) in zip(bottoms, real_frames, strict=True)]  # fmt: skip
+    every = torch.cat(left).abs()
     assert len(every) > 150
     assert every.median() < 0.06
     assert every.quantile(0.9) < 0.2
+
+
+def test_five_fits_of_the_plane_are_enough(
+    real_frames: list[tuple[Tensor, Tensor]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Under labelled objects the ground lies within 3 cm of where 20 fits put it; two fits are too few."""
+    found = {}
+    for fits in (2, ground.ITERATIONS, 20):
+        monkeypatch.setattr(ground, "ITERATIONS", fits)
+        found[fits] = torch.cat([ground_at(points, boxes[:, :2]) for points, boxes in real_frames])
+    off = {fits: (heights - found[20]).abs().max() for fits, heights in found.items()}
+    assert off[5] < 0.03
+    assert off[2] > 0.2

@@ -31,8 +31,9 @@ REACH = 3.0
 ALONE = 0.05
 """Weight of the plane itself, where cells are far."""
 ITERATIONS = 5
-"""Fits of the plane, each with the weights that the one before gives. With five, labelled cars stand as near to the
-ground as with twelve; on one of 53 frames, tilted by 1.2 %, five were too few."""
+"""Fits of the plane, each with the weights that the one before gives. With five, the ground under the labelled objects
+of 33 frames is within 3 cm of where 20 put it, with three within 11 cm; on one of 53 frames, tilted by 1.2 %, five were
+too few."""
 
 
 def ground_map(points: Tensor, reach: float) -> Tensor:
@@ -81,17 +82,27 @@ def reach_of(point_range: Sequence[float]) -> float:
     return max(abs(point_range[k]) for k in (0, 1, 3, 4))
 
 
+def relief_map(points: Tensor, reach: float, wanted: float) -> Tensor:
+    """By how many metres (B, S, S) the ground under clouds (B, N, 3 or more) is above a height; see `ground_map`.
+
+    0 where no ground is found.
+    """
+    return (ground_map(points, reach) - wanted).nan_to_num(0.0)
+
+
+def lower(rows: Tensor, relief: Tensor) -> Tensor:
+    """Points or boxes (B, N, 3 or more), lowered by the relief (B, S, S) at their places."""
+    heights = rows[..., 2] - heights_at(relief, rows[..., :2])
+    return torch.cat((rows[..., :2], heights[..., None], rows[..., 3:]), dim=2)
+
+
 def flatten(points: Tensor, boxes: Tensor, wanted: float, point_range: Sequence[float]) -> tuple[Tensor, Tensor]:
     """Points (N, 4) and boxes (M, 7) of a frame, raised and lowered so that the ground under them lies at a height.
 
     Where no ground is found they stay as they are.
     """
-    ground = ground_map(points[None], reach_of(point_range))
-    moved = []
-    for rows in (points, boxes):
-        rise = (wanted - heights_at(ground, rows[None, :, :2])[0]).nan_to_num(0.0)
-        moved.append(torch.cat((rows[:, :2], rows[:, 2:3] + rise[:, None], rows[:, 3:]), dim=1))
-    return moved[0], moved[1]
+    relief = relief_map(points[None], reach_of(point_range), wanted)
+    return lower(points[None], relief)[0], lower(boxes[None], relief)[0]
 
 
 def cells_of(reach: float) -> int:

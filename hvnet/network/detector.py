@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from hvnet.data.ground import cells_of, ground_map, heights_at, reach_of
+from hvnet.data.ground import cells_of, lower, reach_of, relief_map
 from hvnet.data.sensor import (
     FEW_IN_RANGE,
     Look,
@@ -211,8 +211,7 @@ class Detector:
             heights = points[..., 2] + shift[:, None]
             xyz = torch.cat((points[..., :2], heights.masked_fill(missing, math.nan)[..., None]), dim=2)
             relief = self.relief(xyz)
-            lowered = points[..., 2] - heights_at(relief, points[..., :2])
-            points = torch.cat((points[..., :2], lowered[..., None], points[..., 3:]), dim=2)
+            points = lower(points, relief)
             reliefs = [relief.flatten()]
         point_range = self.config.encoder.point_range
         placed, bright = place_points(points, counts, shift, self.view_rows, point_range, self.reflectance)
@@ -221,11 +220,8 @@ class Detector:
         return torch.cat((table.flatten(), bright, shift, *reliefs))
 
     def relief(self, points: Tensor) -> Tensor:
-        """By how many metres the ground under clouds (B, N, 3 or more) is above that of the training data: (B, S, S).
-
-        0 where no ground is found.
-        """
-        return (ground_map(points, self.reach) - (self.ground or 0.0)).nan_to_num(0.0)
+        """By how many metres (B, S, S) the ground under clouds (B, N, 3 or more) is above that of the training data."""
+        return relief_map(points, self.reach, self.ground or 0.0)
 
     def shifts(self, points: Tensor, counts: Tensor) -> Tensor:
         """By many threads the metres (B,) by which clouds (B, N, 4) of counts (B,) int32 are raised."""
@@ -250,9 +246,7 @@ class Detector:
         relief = None
         if self.is_flat:
             relief = self.relief(points[None])
-            lowered = points[:, 2:3] - heights_at(relief, points[None, :, :2])[0, :, None]
-            points = torch.cat((points[:, :2], lowered, points[:, 3:]), dim=1)
-            relief = relief[0]
+            points, relief = lower(points[None], relief)[0], relief[0]
         clouds = [view.see(points) for view in self.views]
         bright = torch.stack([too_bright(each, self.config.encoder.point_range) for each in clouds]).amax()
         return Placed(clouds, ground, shift, relief, bright)
@@ -295,7 +289,7 @@ class Detector:
                 each = each.select(beyond <= SEAM)
             boxes = View(angle).take_back(each.boxes)
             if move.relief is not None:
-                boxes[:, 2] += heights_at(move.relief[None], boxes[None, :, :2])[0]
+                boxes = lower(boxes[None], -move.relief[None])[0]
             boxes[:, 2] -= move.shift
             parts.append(each._replace(boxes=boxes))
         joined = Detections(*(torch.cat(column) for column in zip(*parts, strict=True)))
