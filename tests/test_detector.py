@@ -14,6 +14,7 @@ from torch._library.custom_ops import OPDEFS
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from hvnet.config import ClassConfig, Config, config_to_dict, load_config
+from hvnet.data.ground import flatten
 from hvnet.data.kitti import read_frame
 from hvnet.exceptions import InputError
 from hvnet.kernels import launch
@@ -521,6 +522,33 @@ def sloped(rows: Tensor) -> Tensor:
 def test_a_slope_is_taken_out_and_put_back(street: Tensor, options: dict[str, Any]) -> None:
     want = on_ground(**options)(street)
     agree(on_ground(**options)(sloped(street)), want._replace(boxes=sloped(want.boxes)))
+
+
+@both_ways
+def test_all_round_finds_the_cars_of_the_front_on_any_ground(kitti_root: Path) -> None:
+    """As the frame is, on level ground, and with either raised: the labelled cars that the front view finds, in the
+    sensor's axes."""
+    frame = read_frame(kitti_root, "000008")
+    assert frame.objects is not None
+    cars = frame.objects.boxes[[name == "Car" for name in frame.objects.names]].float()
+    front, all_round = load(device="cpu"), load(device="cpu", all_round=True)
+    assert front.is_flat
+    assert all_round.is_flat
+    level = flatten(frame.points, cars, -1.9, front.config.encoder.point_range)
+    assert (level[1] - cars)[:, 2].abs().max() > 0.2
+    for points, labelled in ((frame.points, cars), level):
+        for height in (0.0, 1.33):
+            up = torch.tensor([0, 0, height, 0])
+            want = labelled + torch.tensor([0, 0, height, 0, 0, 0, 0])
+            seen = [found.select((found.labels == 0) & (found.scores > 0.5)).boxes
+                    for found in (front(points + up), all_round(points + up))]  # fmt: skip
+            overlaps = [rotated_iou_bev(want, boxes) for boxes in seen]
+            of_front = overlaps[0].amax(dim=1) > 0.5
+            assert of_front.sum() >= 4
+            assert (overlaps[1].amax(dim=1) > 0.5)[of_front].all()
+            for overlap, boxes in zip(overlaps, seen, strict=True):
+                z = boxes[overlap.argmax(dim=1)][:, 2]
+                torch.testing.assert_close(z[of_front], want[of_front][:, 2], rtol=0, atol=0.2)
 
 
 @both_ways
