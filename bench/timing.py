@@ -287,6 +287,8 @@ def start(name: str, args: argparse.Namespace) -> Bench:
         raise InputError("--device cuda: torch sees no GPU here")
     if args.save:
         args.csv = RESULTS / (f"{name}.csv" if args.device == "cpu" else f"{name}_cuda.csv")
+    gc.collect()
+    gc.freeze()  # what is imported lives on: no collection between timings has to look at it
     torch.set_num_threads(args.threads)
     torch.manual_seed(0)
     device = torch.device(args.device)
