@@ -1,5 +1,6 @@
 """Rotated IoU, NMS and matching against shapely in float64, hand-made cases and their twins."""
 
+import functools
 import math
 import re
 from collections.abc import Callable
@@ -76,14 +77,21 @@ def test_random_boxes(scale: float, centre: float, dtype: torch.dtype, device: t
     equals(rotated.rotated_iou_bev(b.to(device), a.to(device)).T, bev.cpu(), TOLERANCE[dtype])
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("scale", [1e-3, 1, 1e3])
-def test_overlap_is_seen_exactly(scale: float, dtype: torch.dtype, device: torch.device) -> None:
-    """A thousandth of a scale apart is an IoU of 0, not a rounding: matching and NMS ask whether it is above 0."""
+@functools.cache
+def boxes_that_overlap(scale: float, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+    """Boxes (M, 7), and by shapely which pairs (M, M) are apart and which share an area."""
     boxes = random_boxes(300, 14, 10, scale).to(dtype)
     area = polygons(boxes)
     apart = torch.from_numpy(shapely.distance(area[:, None], area[None]) > 1e-3 * scale)
     shared = torch.from_numpy(shapely.area(shapely.intersection(area[:, None], area[None])) > 1e-6 * scale**2)
+    return boxes, apart, shared
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("scale", [1e-3, 1, 1e3])
+def test_overlap_is_seen_exactly(scale: float, dtype: torch.dtype, device: torch.device) -> None:
+    """A thousandth of a scale apart is an IoU of 0, not a rounding: matching and NMS ask whether it is above 0."""
+    boxes, apart, shared = boxes_that_overlap(scale, dtype)
     for iou in (rotated.rotated_iou_bev, rotated.rotated_iou_3d):
         assert not iou(boxes.to(device), boxes.to(device)).cpu()[apart].any()
     assert rotated.rotated_iou_bev(boxes.to(device), boxes.to(device)).cpu()[shared].all()
@@ -228,14 +236,21 @@ def test_layout_does_not_matter(device: torch.device) -> None:
             assert torch.equal(first, second)
 
 
+@functools.cache
+def boxes_to_suppress(count: int, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+    """Boxes (M, 7), scores (M,), and the IoU (M, M) by the twin."""
+    boxes = random_boxes(count, 14, spread=10).to(dtype)
+    scores = torch.rand(count, generator=torch.Generator().manual_seed(count)).to(dtype)
+    return boxes, scores, reference.rotated_iou_bev(boxes.double(), boxes.double())
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("threshold", [0.0, 0.1, 0.5])
 @pytest.mark.parametrize("count", [1, 2, 63, 64, 65, 129, 400])
 def test_nms_equals_twin(count: int, threshold: float, dtype: torch.dtype, device: torch.device) -> None:
-    boxes = random_boxes(count, 14, spread=10).to(dtype)
-    scores = torch.rand(count, generator=torch.Generator().manual_seed(count)).to(dtype)
+    boxes, scores, iou = boxes_to_suppress(count, dtype)
     if threshold:  # no pair so near to the threshold that rounding decides
-        assert not ((reference.rotated_iou_bev(boxes.double(), boxes.double()) - threshold).abs() < 1e-5).any()
+        assert not ((iou - threshold).abs() < 1e-5).any()
     kept = rotated.rotated_nms(boxes.to(device), scores.to(device), threshold)
     assert kept.dtype == torch.int64
     assert kept.tolist() == reference.rotated_nms(boxes, scores, threshold).tolist()
@@ -254,22 +269,32 @@ def test_nms_of_one_thread_and_of_many(count: int, dtype: torch.dtype, device: t
     assert not (serial & ~keep).any()
 
 
+@functools.cache
+def groups_to_suppress(dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor, list[Tensor]]:
+    """Boxes (6, 130, 7), which of them are valid (6, 130), how many count (6,), and of every group the IoU by the twin.
+
+    Groups without a box, with a few, with one word and one more, and full ones.
+    """
+    counts = torch.tensor([0, 1, 64, 65, 130, 999], dtype=torch.int32)  # the last: all that there are
+    boxes = random_boxes(6 * 130, 31, spread=9).to(dtype).view(6, 130, 7)
+    valid = torch.rand(6, 130, generator=torch.Generator().manual_seed(0)) > 0.1
+    boxes[2, ~valid[2]] = torch.nan
+    ious = [reference.rotated_iou_bev(*[group.double().nan_to_num(0.0)] * 2) for group in boxes]
+    for b in range(6):  # what only fills up the array would change the result, were it looked at
+        boxes[b, counts[b] :] = boxes[b, 0].nan_to_num(1.0)
+    return boxes, valid, counts, ious
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("limit", [0, 7, 200])
 @pytest.mark.parametrize("thresholds", [(0.1,), (0.02, 0.4, 0.7)])
 def test_nms_of_groups_equals_twin(
     thresholds: tuple[float, ...], limit: int, dtype: torch.dtype, device: torch.device
 ) -> None:
-    """Groups without a box, with a few, with one word and one more, and full ones; each has its own threshold."""
-    counts = torch.tensor([0, 1, 64, 65, 130, 999], dtype=torch.int32)  # the last: all that there are
-    boxes = random_boxes(6 * 130, 31, spread=9).to(dtype).view(6, 130, 7)
-    valid = torch.rand(6, 130, generator=torch.Generator().manual_seed(0)) > 0.1
-    boxes[2, ~valid[2]] = torch.nan
-    for group, threshold in zip(boxes, thresholds * 6, strict=False):  # no pair that rounding decides
-        iou = reference.rotated_iou_bev(*[group.double().nan_to_num(0.0)] * 2)
+    """Each group has its own threshold."""
+    boxes, valid, counts, ious = groups_to_suppress(dtype)
+    for iou, threshold in zip(ious, thresholds * 6, strict=False):  # no pair that rounding decides
         assert not ((iou - threshold).abs() < 1e-5).any()
-    for b in range(6):  # what only fills up the array would change the result, were it looked at
-        boxes[b, counts[b] :] = boxes[b, 0].nan_to_num(1.0)
     given = boxes, valid, counts, torch.tensor(thresholds, dtype=dtype)
     kept = rotated.nms_groups(*(each.to(device) for each in given), limit)
     assert torch.equal(kept.cpu(), reference.nms_groups(*given, limit))
