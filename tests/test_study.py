@@ -19,7 +19,7 @@ from PIL import Image
 
 from hvnet.exceptions import InputError, Stopped
 from hvnet.network.checkpoint import load_checkpoint
-from hvnet.studies import study
+from hvnet.studies import rows, study
 from hvnet.studies.catalogue import STUDIES
 from hvnet.studies.study import locked
 from hvnet.study import main
@@ -35,6 +35,7 @@ def arguments(out: Path, *more: str) -> list[str]:
 def test_a_study_is_written_and_goes_on(
     tmp_path: Path, scenes: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(rows, "REAL_RESAMPLES", 50)  # of two frames
     main(arguments(tmp_path, "--data", str(scenes), "--budget", "steps=2", "--seeds", "1"))
     first = capsys.readouterr().out
     trained: list[Path] = []
@@ -62,21 +63,25 @@ def test_a_study_is_written_and_goes_on(
     assert re.search(rf"^\| real \| Car \|.*\n.*\n\| every point \|{figures}$", table, flags=re.MULTILINE)
     assert re.search(rf"^\| real: less the.*\n.*\n\| 8 points a voxel \|{figures}$", table, flags=re.MULTILINE)
     with (tmp_path / "density.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [(row["row"], row["seed"], row["steps"]) for row in rows] == [
+        table_rows = list(csv.DictReader(file))
+    assert [(row["row"], row["seed"], row["steps"]) for row in table_rows] == [
         ("lossless", "0", "2"),
         ("lossless", "1", "2"),
         ("limit-8", "0", "2"),
         ("limit-8", "1", "2"),
     ]
-    assert 0.01 < float(rows[2]["dropped"]) < 0.9
-    assert rows[2]["dropped"] == rows[2]["real dropped"]  # the same frames
-    assert {row["train frames"] for row in rows} == {"4"}
+    assert 0.01 < float(table_rows[2]["dropped"]) < 0.9
+    assert table_rows[2]["dropped"] == table_rows[2]["real dropped"]  # the same frames
+    assert {row["train frames"] for row in table_rows} == {"4"}
     with Image.open(tmp_path / "density.png") as picture:
         assert picture.size[0] > 400
     files = sorted((tmp_path / "rows").glob("*/result.json"))
     assert [json.loads(file.read_text())["steps"] for file in files] == [2] * 4
-    for file in files:  # damaged: scored again from its checkpoint, which is whole; another row is left out
+    # damaged: scored again from its checkpoint, which is whole; another row is left out. One file of either row
+    of_rows = {load_checkpoint(file.with_name("checkpoint.pt"))["config"]["encoder"]["point_limit"]: file
+               for file in files}  # fmt: skip
+    assert of_rows.keys() == {0, 8}
+    for file in of_rows.values():
         whole = file.read_text()
         file.write_text("")
         main([*arguments(tmp_path, "--data", str(scenes), "--budget", "steps=2"), "--rows", "limit-8"])
