@@ -258,18 +258,18 @@ def resource_faults(found: Sequence[Found], archs: Sequence[int], folder: Path) 
     """The kernels, but for those of float64, that spill, have an array of their own or too many registers.
 
     One a line; also kernels that the compiled files in the folder do not have. What CUDA's and Warp's own functions put
-    on the stack does not count.
+    on the stack does not count. Kernels of float64 are compiled for the first architecture alone: that they compile.
     """
     faults = []
-    for arch, files in compile_kernels([each.kernel for each in found], archs, folder).items():
+    counted = [each for each in found if each.dtype != "float64"]
+    for arch in archs:
+        wanted = found if arch == archs[0] else counted
         usage: dict[str, Usage] = {}
-        for file in files:
+        for file in compile_kernels([each.kernel for each in wanted], [arch], folder)[arch]:
             usage |= resources(file)
-        for each in found:
-            use = usage.get(each.symbol)
-            if use is None:
-                faults.append(f"sm_{arch} {each}: is not in its module's file")
-            elif each.dtype != "float64":
+        faults += [f"sm_{arch} {each}: is not in its module's file" for each in wanted if each.symbol not in usage]
+        for each in counted:
+            if use := usage.get(each.symbol):
                 own = use.stack - max((STACK_OF.get(name, 0) for name in builtins_of(each.kernel)), default=0)
                 if own > 0 or use.local or use.registers > MAX_REGISTERS:
                     faults.append(f"sm_{arch} {each}: {use.registers} registers, stack {use.stack}, local {use.local}")
