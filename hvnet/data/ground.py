@@ -50,7 +50,7 @@ def ground_map(points: Tensor, reach: float) -> Tensor:
     centre = (torch.arange(side, device=points.device, dtype=torch.float64) - (side - 1) / 2) * CELL
     rows = torch.cat((torch.cartesian_prod(centre, centre), torch.ones_like(heights[0])[:, None]), dim=1)
     middle = (heights.isfinite().sum(dim=1, keepdim=True) - 1).clamp(min=0) // 2
-    median = heights.sort(dim=1).values.gather(1, middle)  # NaN comes last
+    median = heights.nan_to_num(math.inf).sort(dim=1).values.gather(1, middle)
     weight = ((heights - median).abs() < SPREAD).double()
     found = weight.sum(dim=1) >= FEWEST_CELLS
     # level where the cells lie on a line and say nothing across it
@@ -101,8 +101,13 @@ def flatten(points: Tensor, boxes: Tensor, wanted: float, point_range: Sequence[
 
     Where no ground is found they stay as they are.
     """
-    relief = relief_map(points[None], reach_of(point_range), wanted)
-    return lower(points[None], relief)[0], lower(boxes[None], relief)[0]
+    ground = ground_map(points[None], reach_of(point_range))
+    moved = []
+    for rows in (points, boxes):
+        # not by `lower`, which rounds otherwise: the shipped weights were trained with these bits
+        rise = (wanted - heights_at(ground, rows[None, :, :2])[0]).nan_to_num(0.0)
+        moved.append(torch.cat((rows[:, :2], rows[:, 2:3] + rise[:, None], rows[:, 3:]), dim=1))
+    return moved[0], moved[1]
 
 
 def cells_of(reach: float) -> int:
@@ -122,18 +127,17 @@ def solve(matrix: Tensor, values: Tensor) -> Tensor:
 
 def _low_heights(points: Tensor, side: int) -> Tensor:
     """The low points' heights (B, S S) in metres in every cell of the map, NaN where a cell has too few points."""
-    batch_size, cells = len(points), side * side
+    batch_size, cells = points.shape[0], side * side
     x, y, z = points[..., :3].unbind(dim=2)
     column, row, level = x / CELL + side / 2, y / CELL + side / 2, (z - LOWEST) * 1000
     # false for NaN
     seen = (column >= 0) & (column < side) & (row >= 0) & (row < side) & (level >= 0) & (level < LEVELS)
     first = torch.arange(batch_size, device=points.device)[:, None] * cells
     cell = (first + column.nan_to_num(0.0).long() * side + row.nan_to_num(0.0).long()).where(seen, batch_size * cells)
-    # cell and height in one number, which is sorted once
-    key = (cell * LEVELS + level.nan_to_num(0.0).long().clamp(0, LEVELS - 1)).flatten().sort().values
+    # cell and height in one number, which is sorted once; the last one is of no point
+    key = cell * LEVELS + level.nan_to_num(0.0).long().clamp(0, LEVELS - 1)
+    key = torch.cat((key.flatten(), key.new_full((1,), (batch_size * cells + 1) * LEVELS))).sort().values
     starts = torch.searchsorted(key, torch.arange(batch_size * cells + 1, device=points.device) * LEVELS)
-    counts = starts.diff()
-    if not len(key):
-        return points.new_full((batch_size, cells), math.nan)
-    low = key[(starts[:-1] + (counts - 1).clamp(min=0) // SKIPPED).clamp(max=len(key) - 1)] % LEVELS / 1000 + LOWEST
+    counts = starts[1:] - starts[:-1]
+    low = key[starts[:-1] + (counts - 1).clamp(min=0) // SKIPPED] % LEVELS / 1000 + LOWEST
     return low.where(counts >= FEWEST, math.nan).view(batch_size, cells)

@@ -184,43 +184,42 @@ def find_ground(points: Tensor) -> Tensor:
         counts = torch.full((1,), len(points), dtype=torch.int32, device=points.device)
         return ground_heights(cloud, counts)[0].to(points.dtype)
     points = points[:: max(1, len(points) // SAMPLED), :3]
-    height, enough = _common_height(_low_heights(points, NEAR), points)
+    height, enough = common_height(low_heights(points, NEAR), points)
     if not enough:
-        wide, enough_wide = _common_height(_low_heights(points, FAR), points)
+        wide, enough_wide = common_height(low_heights(points, FAR), points)
         height = wide.where(enough_wide, math.nan)
     return height.to(points.dtype)
 
 
-def _low_heights(points: Tensor, far: float) -> Tensor:
+def low_heights(points: Tensor, far: float) -> Tensor:
     """The low points' height in metres in every cell (C,) up to a distance from the sensor; infinite in empty cells."""
     x, y, z = points.unbind(1)
-    distance = torch.hypot(x, y)
+    distance = (x.square() + y.square()).sqrt()
     # false for NaN
     ring = (distance >= NEAREST) & (distance < far) & (z > LOWEST_GROUND) & (z < LOWEST_GROUND + 1000)
     x, y, z = x[ring], y[ring], z[ring]
     side = math.ceil(2 * far / CELL)
     cell = ((x + far) / CELL).int().clamp(0, side - 1) * side + ((y + far) / CELL).int().clamp(0, side - 1)
-    # cell and height, to the centimetre, in one number, which is sorted once
+    # cell and height, to the centimetre, in one number, which is sorted once; the last one is of no point
     levels = 2**17
-    key = (cell * levels + ((z - LOWEST_GROUND) * 100).int()).sort().values
+    key = cell * levels + ((z - LOWEST_GROUND) * 100).int()
+    key = torch.cat((key, key.new_full((1,), side * side * levels))).sort().values
     starts = torch.searchsorted(key, torch.arange(side * side + 1, device=points.device, dtype=torch.int32) * levels)
-    counts = starts.diff()
-    if not len(key):
-        return points.new_full((1,), math.inf)
-    low = key[(starts[:-1] + counts // 20).clamp(max=len(key) - 1)] % levels
+    counts = starts[1:] - starts[:-1]
+    low = key[starts[:-1] + counts // 20] % levels
     return torch.where(counts > 0, low / 100 + LOWEST_GROUND, math.inf)
 
 
-def _common_height(low: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+def common_height(low: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     """The height () that most of the low heights (C,) of points (N, 3) are near, and whether it is the ground's."""
     low = low.sort().values
     total = low.isfinite().sum()
     last = torch.searchsorted(low, low + WINDOW, right=True)
-    counts = (last.minimum(total) - torch.arange(len(low), device=low.device)).clamp(min=0)
+    counts = (last.minimum(total) - torch.arange(low.shape[0], device=low.device)).clamp(min=0)
     best = counts.argmax()
     height = low[best + counts[best] // 2]
     enough = (total >= FEWEST_CELLS) & (counts[best] >= GROUND_SHARE * total)
-    below = (points[:, 2] < height - WINDOW).float().mean()
+    below = (points[:, 2] < height - WINDOW).sum() / torch.ones_like(points[:, 2]).sum().clamp(min=1)
     return height, enough & ((height < ABOVE_ORIGIN) | ((total >= PLAIN_CELLS) & (below < UNDERGROUND)))
 
 

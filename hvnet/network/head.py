@@ -107,12 +107,10 @@ def regress(level: Tensor, chosen: Tensor, weight: Tensor, anchors: int) -> Tens
     inside = (x >= 0) & (x < n_l) & (y >= 0) & (y < n_w)
     first = (cell // (n_l * n_w) * n_l)[:, None, None]  # the first row of cells of the sample
     at = (first + x.clamp(0, n_l - 1)) * n_w + y.clamp(0, n_w - 1)
-    patches = rows.index_select(0, at.flatten()).float().view(len(chosen), 9, channels)
-    patches = patches * inside.view(len(chosen), 9, 1)
-    values = torch.addmm(weight[-1], patches.flatten(1), weight[:-1]).view(
-        len(chosen), anchors, weight.shape[1] // anchors
-    )
-    return values[torch.arange(len(chosen), device=chosen.device), chosen % anchors]
+    patches = rows.index_select(0, at.flatten()).float().view(-1, 9, channels)
+    patches = patches * inside.view(-1, 9, 1)
+    values = torch.addmm(weight[-1], patches.flatten(1), weight[:-1]).view(-1, anchors, weight.shape[1] // anchors)
+    return values[torch.arange(chosen.shape[0], device=chosen.device), chosen % anchors]
 
 
 def scores_of(logits: Tensor, iou: Tensor | None) -> Tensor:
