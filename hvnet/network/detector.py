@@ -436,6 +436,7 @@ def load(
     checkpoint: str | Path | None = None,
     device: str = "auto",
     *,
+    dtype: torch.dtype | None = None,
     sensor_height: float | Literal["found", "none"] = "found",
     turn: float = 0.0,
     all_round: bool = False,
@@ -444,7 +445,9 @@ def load(
     """A detector from a checkpoint of `python -m hvnet.train`, or from weights that come with the package.
 
     checkpoint: a file, or the name of weights, such as "compact", which is the default.
-    device: auto (CUDA where there is a GPU), cpu, cuda or cuda:N. sensor_height, turn, all_round, tta: see `Detector`.
+    device: auto (CUDA where there is a GPU), cpu, cuda or cuda:N.
+    dtype: of backbone and heads; None: what the device is fastest with, bfloat16 or float32.
+    sensor_height, turn, all_round, tta: see `Detector`.
     Raises InputError naming the file, or the device.
     """
     path = find_checkpoint(checkpoint)
@@ -460,6 +463,7 @@ def load(
     return Detector(
         model_from_checkpoint(content, str(path)),
         select_device(device),
+        dtype,
         ground=ground,
         reflectance=facts.get("reflectance_scale") != 0,
         sensor_height=sensor_height,
