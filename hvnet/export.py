@@ -5,54 +5,76 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+import torch
+
 from hvnet.cli import add_checkpoint, make_parser, run_command
 from hvnet.exceptions import InputError
 from hvnet.folders import check_empty
 from hvnet.network.checkpoint import find_checkpoint, load_checkpoint, model_from_checkpoint
-from hvnet.network.export import describe, is_program, write_onnx, write_program
+from hvnet.network.detector import load
+from hvnet.network.export import describe, dropped_points, write_detector, write_onnx, write_program
 
 
 def main(arguments: Sequence[str] | None) -> None:
     """The command."""
     parser = make_parser(
         "export",
-        "Writes a trained model for deployment: backbone_heads.onnx (pseudo-images to the heads' maps), detector.pt2 "
-        "(points to the heads' maps, a program of torch.export) and meta.json (anchors, thresholds). docs/deploy.md "
-        "says how to run them.",
-        ["", "--checkpoint runs/demo/checkpoint.pt --out deploy/demo", "--batch 4 --out deploy/four"],
+        "Writes a trained model for deployment: detector.onnx (points to boxes), backbone_heads.onnx (pseudo-images to "
+        "the heads' maps), detector.pt2 (points to the heads' maps, a program of torch.export) and meta.json (classes, "
+        "anchors, thresholds). docs/deploy.md says how to run them.",
+        ["", "--checkpoint runs/demo/checkpoint.pt --out deploy/demo", "--without-nms", "--batch 4 --out deploy/four"],
     )
     add_checkpoint(parser)
     parser.add_argument("--out", type=Path, default=Path("export"), metavar="DIR", help="(default: export)")
+    parser.add_argument(
+        "--without-nms", action="store_true", help="detector.onnx gives the candidates that go into NMS"
+    )
+    parser.add_argument(
+        "--without-encoder",
+        action="store_true",
+        help="writes backbone_heads.onnx and meta.json alone, as is possible with every encoder",
+    )
     parser.add_argument(
         "--batch",
         type=int,
         default=1,
         metavar="N",
-        help="clouds that detector.pt2 takes at a time; the ONNX file takes any number (default: 1)",
+        help="clouds that detector.pt2 takes at a time; backbone_heads.onnx takes any number, detector.onnx one "
+        "(default: 1)",
     )
     options = parser.parse_args(arguments)
     if options.batch < 1:
         raise InputError(f"--batch {options.batch}: want 1 or more")
+    if options.without_encoder and options.without_nms:
+        raise InputError("--without-nms: there is no detector.onnx with --without-encoder; leave one of them out")
     if importlib.util.find_spec("onnx") is None:
         raise InputError("the package onnx is missing, without which torch writes no ONNX file: pip install onnx")
     check_empty(options.out)
 
     path = find_checkpoint(options.checkpoint)
     model = model_from_checkpoint(load_checkpoint(path), str(path))
+    drops = dropped_points(model.config)
+    if drops and not options.without_encoder:
+        raise InputError(
+            f"{path}: cannot be exported from points on, since with {drops} it drops some of them; --without-encoder "
+            "writes what comes after its encoder"
+        )
     try:
         options.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{options.out}: cannot be made a folder ({error.strerror}); give another --out") from error
     meta = options.out / "meta.json"
-    meta.write_text(json.dumps(describe(model.config, options.batch), indent=2) + "\n", encoding="utf-8")
-    print(f"meta:    {meta}")
+    content = describe(model.config, options.batch)
+    meta.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    print(f"meta:     {meta}")
     write_onnx(model, options.out / "backbone_heads.onnx")
-    print(f"ONNX:    {options.out / 'backbone_heads.onnx'}")
-    if is_program(model):
-        write_program(model, options.out / "detector.pt2", options.batch)
-        print(f"program: {options.out / 'detector.pt2'}")
-    else:
-        print("program: none; torch.export cannot take an encoder that drops points")
+    print(f"backbone: {options.out / 'backbone_heads.onnx'}")
+    if options.without_encoder:
+        return
+    write_detector(load(path, "cpu", dtype=torch.float32), options.out / "detector.onnx", not options.without_nms)
+    print(f"detector: {options.out / 'detector.onnx'}")
+    write_program(model, options.out / "detector.pt2", options.batch)
+    print(f"program:  {options.out / 'detector.pt2'}")
 
 
 if __name__ == "__main__":

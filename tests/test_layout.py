@@ -15,7 +15,11 @@ LAYERS = ("base", "kernels", "data", "network", "evaluation", "pictures", "train
 BASE = {"__init__", "exceptions", "boxes", "config", "folders", "ranks"}
 LIBRARIES = {"kernels": {"kernels"}, "network": {"base", "kernels", "network"}}
 """Layers that know less than what is below them."""
-SHARED = {("network.detector", "data.sensor"), ("network.detector", "data.ground")}
+SHARED = {
+    (f"network.{module}", f"data.{other}")
+    for module in ("detector", "points_to_boxes")
+    for other in ("sensor", "ground")
+}
 """... but for the one judge of clouds, which arrays pass as files do, and the ground, which training takes out too."""
 
 
