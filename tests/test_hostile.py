@@ -27,7 +27,14 @@ from hvnet.network.detector import Detector, load
 from hvnet.network.model import HVNet
 from tests.helpers import CAMERA, ROOT
 
-NARROW = ["encoder.point_range=[0, -3.2, -3, 12.8, 3.2, 2]", "head.score_threshold=0.0", "head.candidates=50"]
+NARROW = [
+    "encoder.point_range=[0, -3.2, -3, 12.8, 3.2, 2]",
+    "backbone.widths=[8, 8, 8]",
+    "backbone.layers=[2, 2, 2]",
+    "backbone.fusion_channels=8",
+    "head.score_threshold=0.0",
+    "head.candidates=50",
+]
 SECONDS = 10.0  # that any one of them may take
 LARGE = 64 * 2**20
 
