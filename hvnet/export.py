@@ -13,6 +13,7 @@ from hvnet.folders import check_empty
 from hvnet.network.checkpoint import find_checkpoint, load_checkpoint, model_from_checkpoint
 from hvnet.network.detector import load
 from hvnet.network.export import describe, dropped_points, write_detector, write_onnx, write_program
+from hvnet.network.page import fetch_runtime, write_page
 
 
 def main(arguments: Sequence[str] | None) -> None:
@@ -42,11 +43,16 @@ def main(arguments: Sequence[str] | None) -> None:
         help="clouds that detector.pt2 takes at a time; backbone_heads.onnx takes any number, detector.onnx one "
         "(default: 1)",
     )
+    parser.add_argument(
+        "--page", action="store_true", help="add a page that detects in a browser (index.html); npm gets its runtime"
+    )
     options = parser.parse_args(arguments)
     if options.batch < 1:
         raise InputError(f"--batch {options.batch}: want 1 or more")
     if options.without_encoder and options.without_nms:
         raise InputError("--without-nms: there is no detector.onnx with --without-encoder; leave one of them out")
+    if options.page and (options.without_encoder or options.without_nms):
+        raise InputError("--page: wants detector.onnx to give boxes; leave --without-encoder and --without-nms out")
     if importlib.util.find_spec("onnx") is None:
         raise InputError("the package onnx is missing, without which torch writes no ONNX file: pip install onnx")
     check_empty(options.out)
@@ -59,6 +65,7 @@ def main(arguments: Sequence[str] | None) -> None:
             f"{path}: cannot be exported from points on, since with {drops} it drops some of them; --without-encoder "
             "writes what comes after its encoder"
         )
+    runtime = fetch_runtime() if options.page else {}
     try:
         options.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -75,6 +82,9 @@ def main(arguments: Sequence[str] | None) -> None:
     print(f"detector: {options.out / 'detector.onnx'}")
     write_program(model, options.out / "detector.pt2", options.batch)
     print(f"program:  {options.out / 'detector.pt2'}")
+    if options.page:
+        write_page(options.out, runtime)
+        print(f"page:     {options.out / 'index.html'}; to serve it: python -m http.server -d {options.out}")
 
 
 if __name__ == "__main__":
