@@ -56,6 +56,8 @@ def session_of(file: Path, threads: int, profile: str = "") -> onnxruntime.Infer
     """onnxruntime's session of a file on the CPU."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
+    # its threads would wait for work on the cores that torch has its turn on
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     if profile:
         options.enable_profiling = True
         options.profile_file_prefix = profile

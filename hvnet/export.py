@@ -23,7 +23,13 @@ def main(arguments: Sequence[str] | None) -> None:
         "Writes a trained model for deployment: detector.onnx (points to boxes), backbone_heads.onnx (pseudo-images to "
         "the heads' maps), detector.pt2 (points to the heads' maps, a program of torch.export) and meta.json (classes, "
         "anchors, thresholds). docs/deploy.md says how to run them.",
-        ["", "--checkpoint runs/demo/checkpoint.pt --out deploy/demo", "--without-nms", "--batch 4 --out deploy/four"],
+        [
+            "",
+            "--checkpoint runs/demo/checkpoint.pt --out deploy/demo",
+            "--page --out page",
+            "--without-nms",
+            "--batch 4 --out deploy/four",
+        ],
     )
     add_checkpoint(parser)
     parser.add_argument("--out", type=Path, default=Path("export"), metavar="DIR", help="(default: export)")
@@ -44,7 +50,10 @@ def main(arguments: Sequence[str] | None) -> None:
         "(default: 1)",
     )
     parser.add_argument(
-        "--page", action="store_true", help="add a page that detects in a browser (index.html); npm gets its runtime"
+        "--page",
+        action="store_true",
+        help="writes a folder to serve instead: a page that detects in a browser, detector.onnx, meta.json and the "
+        "runtime, which npm gets",
     )
     options = parser.parse_args(arguments)
     if options.batch < 1:
@@ -74,17 +83,18 @@ def main(arguments: Sequence[str] | None) -> None:
     content = describe(model.config, options.batch)
     meta.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     print(f"meta:     {meta}")
-    write_onnx(model, options.out / "backbone_heads.onnx")
-    print(f"backbone: {options.out / 'backbone_heads.onnx'}")
-    if options.without_encoder:
-        return
-    write_detector(load(path, "cpu", dtype=torch.float32), options.out / "detector.onnx", not options.without_nms)
-    print(f"detector: {options.out / 'detector.onnx'}")
-    write_program(model, options.out / "detector.pt2", options.batch)
-    print(f"program:  {options.out / 'detector.pt2'}")
+    if not options.without_encoder:
+        write_detector(load(path, "cpu", dtype=torch.float32), options.out / "detector.onnx", not options.without_nms)
+        print(f"detector: {options.out / 'detector.onnx'}")
     if options.page:
         write_page(options.out, runtime)
         print(f"page:     {options.out / 'index.html'}; to serve it: python -m http.server -d {options.out}")
+        return
+    write_onnx(model, options.out / "backbone_heads.onnx")
+    print(f"backbone: {options.out / 'backbone_heads.onnx'}")
+    if not options.without_encoder:
+        write_program(model, options.out / "detector.pt2", options.batch)
+        print(f"program:  {options.out / 'detector.pt2'}")
 
 
 if __name__ == "__main__":

@@ -90,16 +90,14 @@ def js_file(path: Path) -> str:
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that the command writes, but for the program, which takes long."""
+    """The folder that the command writes."""
     pytest.importorskip("onnx", reason="onnx is not installed: pip install '.[test]'")
     pytest.importorskip("websockets", reason="websockets is not installed: pip install '.[test]'")
     if CHROMIUM is None:
         pytest.skip("no Chromium")
     out = tmp_path_factory.mktemp("page") / "export"
     try:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(export, "write_program", lambda *_: None)
-            export.main(["--page", "--out", str(out)])
+        export.main(["--page", "--out", str(out)])
     except InputError as error:
         if RUNTIME not in str(error):
             raise

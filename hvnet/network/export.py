@@ -181,7 +181,8 @@ def _searchsorted(
     last = g.op("Sub", size, one)
     low = g.op("ConstantOfShape", g.op("Shape", values), value_t=torch.zeros(1, dtype=torch.int64))
     high = g.op("Add", low, size)
-    for _ in range(SEARCHES):
+    known = symbolic_helper._get_tensor_sizes(ordered)
+    for _ in range(known[0].bit_length() if known and known[0] else SEARCHES):
         middle = g.op("Div", g.op("Add", low, high), two)
         found = g.op("Gather", ordered, g.op("Min", middle, last), axis_i=0)
         later = g.op("LessOrEqual" if right else "Less", found, values)

@@ -241,9 +241,14 @@ def places(points: Tensor, cell: Tensor, grid: Grid) -> Places:
 
 
 def row_maxima(rows: Tensor, index: Tensor, zeros: Tensor) -> Tensor:
-    """The largest of rows (N, C) with each index (N,): of the shape of `zeros` (R, C), and 0 where there is none."""
-    lowest = torch.full_like(zeros, -math.inf)
-    largest = lowest.scatter_reduce(0, index[:, None].expand(-1, zeros.shape[1]), rows, "amax")
+    """The largest of rows (N, C) with each index (N,): of the shape of `zeros` (R, C), and 0 where there is none.
+
+    In one dimension, where onnxruntime's scatter takes two thirds of the time.
+    """
+    channels = zeros.shape[1]
+    places = index[:, None] * channels + torch.arange(channels)
+    lowest = torch.full_like(zeros, -math.inf).flatten()
+    largest = lowest.scatter_reduce(0, places.flatten(), rows.flatten(), "amax").view(-1, channels)
     return torch.where(largest == -math.inf, 0.0, largest)
 
 
