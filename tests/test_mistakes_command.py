@@ -63,7 +63,7 @@ def test_any_class_has_mistakes(scenes: Path, tmp_path: Path) -> None:
     page = Page((tmp_path / "page.html").read_text())
     assert "Van detected" in page.text
     assert "Cyclist BEV" not in page.text
-    assert re.search(r"labels of classes that the config does not have count as background: \d+ Cyclist\.", page.text)
+    assert re.search(r"Labels of classes that the config does not have count as background: \d+ Cyclist\.", page.text)
     assert "Van BEV0.5" in page.text  # as small as the anchors of Cyclist
     main([*given, "--out", str(tmp_path / "other.html"), "--overlap", "Van=0.7"])
     assert "Van BEV0.7" in Page((tmp_path / "other.html").read_text()).text

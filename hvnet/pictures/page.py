@@ -69,7 +69,7 @@ figcaption { margin-top: .3em }
 <h1>What the detector gets wrong</h1>
 <p>{{ checkpoint }} in the {{ frames }} frames of the validation split of {{ root }}, at score {{ min_score }} or more:
 {{ misses_in_all }} misses and {{ false_positives_in_all }} false positives.
-{%- if background %} There are {{ background }}.{% endif %}</p>
+{%- if background %} {{ background[0]|upper }}{{ background[1:] }}.{% endif %}</p>
 
 <h2>Evaluation</h2>
 <table>
