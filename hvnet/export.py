@@ -2,7 +2,9 @@
 
 import importlib.util
 import json
-from collections.abc import Sequence
+import shlex
+from argparse import Namespace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -13,7 +15,10 @@ from hvnet.folders import check_empty
 from hvnet.network.checkpoint import find_checkpoint, load_checkpoint, model_from_checkpoint
 from hvnet.network.detector import load
 from hvnet.network.export import describe, dropped_points, write_detector, write_onnx, write_program
+from hvnet.network.model import HVNet
 from hvnet.network.page import fetch_runtime, write_page
+
+SERVE = "python -m http.server --bind 127.0.0.1 --directory"
 
 
 def main(arguments: Sequence[str] | None) -> None:
@@ -62,6 +67,10 @@ def main(arguments: Sequence[str] | None) -> None:
         raise InputError("--without-nms: there is no detector.onnx with --without-encoder; leave one of them out")
     if options.page and (options.without_encoder or options.without_nms):
         raise InputError("--page: wants detector.onnx to give boxes; leave --without-encoder and --without-nms out")
+    if options.batch != 1 and (options.page or options.without_encoder):
+        raise InputError(
+            f"--batch {options.batch}: is of detector.pt2, which --page and --without-encoder do not write"
+        )
     if importlib.util.find_spec("onnx") is None:
         raise InputError("the package onnx is missing, without which torch writes no ONNX file: pip install onnx")
     check_empty(options.out)
@@ -79,22 +88,34 @@ def main(arguments: Sequence[str] | None) -> None:
         options.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{options.out}: cannot be made a folder ({error.strerror}); give another --out") from error
-    meta = options.out / "meta.json"
+    try:
+        write(options, path, model, runtime)
+    except OSError as error:
+        for written in options.out.iterdir():
+            written.unlink()
+        raise InputError(
+            f"{options.out}: cannot be written ({error.strerror}); make room, or give another --out"
+        ) from error
+
+
+def write(options: Namespace, path: Path, model: HVNet, runtime: Mapping[str, bytes]) -> None:
+    """Writes what the options ask for of a model, the checkpoint at a path, and says so file by file."""
+    out = options.out
     content = describe(model.config, options.batch)
-    meta.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    print(f"meta:     {meta}")
+    (out / "meta.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    print(f"meta:     {out / 'meta.json'}")
     if not options.without_encoder:
-        write_detector(load(path, "cpu", dtype=torch.float32), options.out / "detector.onnx", not options.without_nms)
-        print(f"detector: {options.out / 'detector.onnx'}")
+        write_detector(load(path, "cpu", dtype=torch.float32), out / "detector.onnx", not options.without_nms)
+        print(f"detector: {out / 'detector.onnx'}")
     if options.page:
-        write_page(options.out, runtime)
-        print(f"page:     {options.out / 'index.html'}; to serve it: python -m http.server -d {options.out}")
+        write_page(out, runtime)
+        print(f"page:     {out / 'index.html'}; to serve it: {SERVE} {shlex.quote(str(out))}")
         return
-    write_onnx(model, options.out / "backbone_heads.onnx")
-    print(f"backbone: {options.out / 'backbone_heads.onnx'}")
+    write_onnx(model, out / "backbone_heads.onnx")
+    print(f"backbone: {out / 'backbone_heads.onnx'}")
     if not options.without_encoder:
-        write_program(model, options.out / "detector.pt2", options.batch)
-        print(f"program:  {options.out / 'detector.pt2'}")
+        write_program(model, out / "detector.pt2", options.batch)
+        print(f"program:  {out / 'detector.pt2'}")
 
 
 if __name__ == "__main__":

@@ -232,6 +232,12 @@ def test_what_it_cannot_read_is_said(page: Page, scene: Path, tmp_path: Path) ->
         ("text.pcd", b"hello\n", "the header has no DATA"),
         ("packed.pcd", f"{header}binary_compressed\n".encode(), "is compressed; write it as DATA binary or ascii"),
         ("short.pcd", f"{header}ascii\n1 2 3\n".encode(), "the header says 2 points, the file has 1"),
+        (
+            "huge.pcd",
+            b"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 999999999999\nDATA ascii\n1 2 3\n",
+            "has 1",
+        ),
+        ("hexadecimal.pcd", f"{header}ascii\n1 2 3\n0x10 2 3\n".encode(), "has words that are no numbers"),
         ("long.pcd", f"{header}ascii\n1 2 3\n1 2 3\n\n1 2 3\n".encode(), "line 10 is one more than the 2 points"),
         ("words.pcd", f"{header}ascii\n1 2 3\n1 two 3\n".encode(), "line 8 has words that are no numbers"),
         ("wide.pcd", f"{header}ascii\n1 2 3 4\n".encode(), "line 7 has 4 numbers, want 3"),

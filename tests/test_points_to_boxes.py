@@ -54,7 +54,7 @@ def assert_same(found: Detections, want: Detections) -> None:
     """The same set of boxes, to 1 mm and 1e-4 of score."""
     difference = compare(found, want)
     assert len(found.boxes) == len(want.boxes)
-    assert difference.alone == 0, difference
+    assert difference.unmatched == 0, difference
 
 
 def test_on_real_frames(session: onnxruntime.InferenceSession, detector: Detector, kitti_root: Path) -> None:
@@ -110,7 +110,10 @@ def test_the_file_is_standard(file: Path, detector: Detector) -> None:
     }
     assert shapes == {"points": ["points", 4], "boxes": ["boxes", 7], "scores": ["boxes"], "labels": ["boxes"]}
     assert [each.name for each in model.graph.output] == ["boxes", "scores", "labels"]
-    assert {each.key: each.value for each in model.metadata_props} == {"classes": "\n".join(detector.classes)}
+    assert {each.key: each.value for each in model.metadata_props} == {
+        "classes": "\n".join(detector.classes),
+        "nms": "yes",
+    }
     assert str(ROOT).encode() not in file.read_bytes()
     assert file.stat().st_size < 6e6
 
@@ -141,6 +144,7 @@ def test_without_nms_it_gives_the_candidates(detector: Detector, kitti_root: Pat
         (None, ("backbone.pyramid=none", "head.candidates=40", "head.detections=3")),
         (-1.7, ("encoder.feature_scales=[0.5, 0.75, 2]", "encoder.vfe=plain", "encoder.flat_ground=true")),
         (None, ("head.classes.Car.anchor_sizes=[[3.9, 1.6, 1.56], [9, 2.5, 3]]",)),
+        (None, ("encoder.voxel_size=[0.3, 0.3]",)),  # whose last cells reach past the range
     ],
     ids=str,
 )
@@ -149,7 +153,11 @@ def test_every_switch(ground: float | None, changes: tuple[str, ...], tmp_path: 
     detector = Detector(model, CPU, torch.float32, ground=ground, reflectance=ground is None)
     write_detector(detector, tmp_path / "detector.onnx")
     session = session_of(tmp_path / "detector.onnx", 1)
-    for points in (some_points(), some_points(3000), some_points(3)):
+    x_max, y_max = model.config.encoder.point_range[3:5]
+    border = some_points(3000)
+    border[::5, 0] = torch.linspace(x_max - 0.1, x_max + 0.4, 600)
+    border[1::5, 1] = torch.linspace(y_max - 0.1, y_max + 0.4, 600)
+    for points in (some_points(), border, some_points(3)):
         want = detector(points)
         assert_same(run(session, points), want)
     assert all(weight.requires_grad for weight in model.parameters())
@@ -197,16 +205,23 @@ def test_suppress(limit: int) -> None:
     assert len(suppress(boxes[:0], labels[:0], thresholds, limit)) == 0
 
 
+@pytest.mark.parametrize("dtype", ["float32", torch.int32])
+def test_a_dtype_that_is_none(dtype: object) -> None:
+    with pytest.raises(ValueError, match=r"dtype: want a floating type of torch, such as torch\.float32, got"):
+        hvnet.load(device="cpu", dtype=dtype)  # type: ignore[arg-type]
+
+
 def test_compare_sees_what_differs() -> None:
     """The comparison of the benchmark and of these tests can fail."""
     boxes = torch.tensor([[10.0, 0, -1, 4, 2, 1.5, 3.14159], [20, 0, -1, 4, 2, 1.5, 0]])
     want = Detections(boxes, torch.tensor([0.9, 0.5]), torch.tensor([0, 1]))
     turned = boxes.clone()
     turned[0, 6] = -3.14159
-    assert compare(Detections(turned, want.scores, want.labels).select(torch.tensor([1, 0])), want).alone == 0
+    assert compare(Detections(turned, want.scores, want.labels).select(torch.tensor([1, 0])), want).unmatched == 0
     moved = boxes + torch.tensor([0.0, 0, 0.002, 0, 0, 0, 0])
     assert compare(want._replace(boxes=moved), want) == Difference(2, 4, 0.0, 0.0)
-    assert compare(want._replace(scores=want.scores + 2e-4), want).alone == 4
-    assert compare(want._replace(labels=1 - want.labels), want).alone == 4
-    assert compare(want.select(torch.tensor([0])), want).alone == 1
-    assert compare(want.select(torch.zeros(0, dtype=torch.int64)), want).alone == 2
+    assert compare(want._replace(scores=want.scores + 2e-4), want).unmatched == 4
+    assert compare(want._replace(labels=1 - want.labels), want).unmatched == 4
+    assert compare(want.select(torch.tensor([0])), want).unmatched == 1
+    assert compare(want.select(torch.tensor([0, 1, 0, 1])), want).unmatched == 2
+    assert compare(want.select(torch.zeros(0, dtype=torch.int64)), want).unmatched == 2

@@ -114,6 +114,8 @@ class Detector:
             raise ValueError(f"sensor_height: want metres, 'found' or 'none', got {sensor_height!r}")
         if not _is_number(turn):
             raise ValueError(f"turn: want degrees, got {turn!r}")
+        if dtype is not None and not (isinstance(dtype, torch.dtype) and dtype.is_floating_point):
+            raise ValueError(f"dtype: want a floating type of torch, such as torch.float32, got {dtype!r}")
         self.ground, self.reflectance, self.sensor_height = ground, reflectance, sensor_height
         self.is_flat = model.config.encoder.flat_ground and ground is not None and sensor_height != "none"
         self.reach = reach_of(model.config.encoder.point_range)

@@ -27,8 +27,8 @@ OPSET = 17
 """ONNX opset of backbone_heads.onnx. All operators in it are older, so that older runtimes read them too."""
 DETECTOR_OPSET = 18
 """ONNX opset of detector.onnx, the first whose ScatterElements has a maximum."""
-SEARCHES = 24
-"""Rounds of a binary search: it goes through 16 million values."""
+SEARCHES = 31
+"""Rounds of a binary search: it goes through two billion values."""
 
 
 def dropped_points(config: Config) -> str:
@@ -109,7 +109,7 @@ def write_detector(detector: Detector, path: Path, nms: bool = True) -> None:
     """A detector on the CPU, in float32 and with one view, as ONNX: see `PointsToBoxes`.
 
     Its config drops no points, see `dropped_points`. The file's metadata have the names of the classes, a line each, as
-    "classes". It needs onnx.
+    "classes", and as "nms" whether it is in the file. It needs onnx.
     """
     import onnx
 
@@ -128,7 +128,7 @@ def write_detector(detector: Detector, path: Path, nms: bool = True) -> None:
         _export(PointsToBoxes(detector, nms), (points,), path, DETECTOR_OPSET, ["points"], outputs, axes)
         written = onnx.load(path)
         written.graph.output[0].type.tensor_type.shape.dim[1].dim_value = 7  # which torch does not know
-        onnx.helper.set_model_props(written, {"classes": "\n".join(detector.classes)})
+        onnx.helper.set_model_props(written, {"classes": "\n".join(detector.classes), "nms": "yes" if nms else "no"})
         onnx.save(written, path)
     finally:
         for name in operators:

@@ -23,7 +23,7 @@ from hvnet.network.grids import projection_grids
 from hvnet.network.head import LOCATION_VALUES, regress, scores_of
 
 
-class Places(NamedTuple):
+class PointVoxels(NamedTuple):
     """The voxels of one scale that points are in."""
 
     cell: Tensor  # (N,) int64, Eq. 1
@@ -48,9 +48,9 @@ class Layer:
             knowledge = folded(layer.knowledge, layer.norm, None)
             self.knowledge = torch.vstack((knowledge[:-1], torch.zeros_like(knowledge[-1:])))
 
-    def __call__(self, features: Tensor, at: Places) -> Tensor:
+    def __call__(self, features: Tensor, voxels: PointVoxels) -> Tensor:
         """M (N, q) of a scale from what `features` makes of the rows (N, q)."""
-        attention = torch.addmm(self.knowledge[-1], at.knowledge, self.knowledge[:-1])
+        attention = torch.addmm(self.knowledge[-1], voxels.knowledge, self.knowledge[:-1])
         if not self.attentive:
             return torch.relu(features + attention)
         return features.relu() * attention.relu() if self.relu else features * attention
@@ -62,9 +62,12 @@ class Place(nn.Module):
     def __init__(self, detector: Detector) -> None:
         super().__init__()
         self.detector = detector
+        assert isinstance(detector.encoder, HybridVoxelEncoder)
+        # the last cells may reach past the range; which points are in them is for the encoder to say
+        self.past = max(max(grid.cell) for grid in detector.encoder.feature_grids + detector.encoder.projection_grids)
 
     def forward(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Points (N, 4) to those within the range in x and y, the shift () and the relief (1, S, S)."""
+        """Points (N, 4) to those near the range in x and y, the shift () and the relief (1, S, S)."""
         detector = self.detector
         xyz, reflectance = points[:, :3], known_reflectance(points[:, 3])
         if not detector.reflectance:
@@ -76,6 +79,7 @@ class Place(nn.Module):
         relief = detector.relief(xyz[None]) if detector.is_flat else torch.zeros(1, 2, 2)
         x_min, y_min, _, x_max, y_max, _ = detector.config.encoder.point_range
         x, y = xyz[:, 0], xyz[:, 1]
+        x_max, y_max = x_max + self.past, y_max + self.past
         kept = ((x >= x_min) & (x < x_max) & (y >= y_min) & (y < y_max)).nonzero().squeeze(1)
         xyz, reflectance = xyz.index_select(0, kept), reflectance.index_select(0, kept)
         if detector.is_flat:
@@ -97,7 +101,7 @@ class Encoder(nn.Module):
         self.feature_grids, self.projection_grids = encoder.feature_grids, encoder.projection_grids
         self.avfe, self.avfeo = Layer(encoder.avfe), Layer(encoder.avfeo)
         halves = self.avfeo.features[:-1].chunk(2 * len(encoder.feature_grids))
-        self.of_product, self.of_maxima = torch.cat(halves[0::2]), halves[1::2]
+        self.product_weight, self.maxima_weights = torch.cat(halves[0::2]), halves[1::2]
 
     def forward(self, points: Tensor) -> list[Tensor]:
         """Placed points (N, 4) to the pseudo-images (1, N_H, N_L, N_W), finest first."""
@@ -105,18 +109,20 @@ class Encoder(nn.Module):
         cells = [cells_of(points, grid) for grid in grids]
         kept = (torch.stack(cells).amin(dim=0) >= 0).nonzero().squeeze(1)
         points = points.index_select(0, kept)
-        at = {grid: places(points, cell.index_select(0, kept), grid) for grid, cell in zip(grids, cells, strict=True)}
+        voxels = {
+            grid: voxels_of(points, cell.index_select(0, kept), grid) for grid, cell in zip(grids, cells, strict=True)
+        }
         features = torch.addmm(self.avfe.features[-1], points, self.avfe.features[:-1])
-        products = [self.avfe(features, at[grid]) for grid in self.feature_grids]
-        context = torch.addmm(self.avfeo.features[-1], torch.cat(products, dim=1), self.of_product)
-        for product, grid, weight in zip(products, self.feature_grids, self.of_maxima, strict=True):
-            voxel = at[grid].voxel
+        products = [self.avfe(features, voxels[grid]) for grid in self.feature_grids]
+        context = torch.addmm(self.avfeo.features[-1], torch.cat(products, dim=1), self.product_weight)
+        for product, grid, weight in zip(products, self.feature_grids, self.maxima_weights, strict=True):
+            voxel = voxels[grid].voxel
             maxima = row_maxima(product, voxel, torch.zeros_like(product)) @ weight
             context = context + maxima.index_select(0, voxel)
         images = []
         for grid in self.projection_grids:
             empty = context.new_zeros(grid.shape[0] * grid.shape[1], context.shape[1])
-            image = row_maxima(self.avfeo(context, at[grid]), at[grid].cell, empty)
+            image = row_maxima(self.avfeo(context, voxels[grid]), voxels[grid].cell, empty)
             images.append(image.view(1, *grid.shape, -1).permute(0, 3, 1, 2))
         return images
 
@@ -227,7 +233,7 @@ def cells_of(points: Tensor, grid: Grid) -> Tensor:
     return torch.where(inside, x * grid.shape[1] + y, -1)
 
 
-def places(points: Tensor, cell: Tensor, grid: Grid) -> Places:
+def voxels_of(points: Tensor, cell: Tensor, grid: Grid) -> PointVoxels:
     """The voxels of points (N, 4) in cells (N,) of a grid, and Eq. 2."""
     number = torch.ones_like(cell)[:, None].cumsum(0) - 1
     # as a column, since a table of one dimension would be written to the file
@@ -237,7 +243,7 @@ def places(points: Tensor, cell: Tensor, grid: Grid) -> Places:
     sums = torch.zeros_like(rows).scatter_add(0, voxel[:, None].expand(-1, 5), rows)
     sums = sums.index_select(0, voxel)
     mean = sums[:, :4] / sums[:, 4:]
-    return Places(cell, voxel, torch.cat((points[:, :3] - mean[:, :3], points[:, 3:], mean), dim=1))
+    return PointVoxels(cell, voxel, torch.cat((points[:, :3] - mean[:, :3], points[:, 3:], mean), dim=1))
 
 
 def row_maxima(rows: Tensor, index: Tensor, zeros: Tensor) -> Tensor:
@@ -246,9 +252,9 @@ def row_maxima(rows: Tensor, index: Tensor, zeros: Tensor) -> Tensor:
     In one dimension, where onnxruntime's scatter takes two thirds of the time.
     """
     channels = zeros.shape[1]
-    places = index[:, None] * channels + torch.arange(channels)
+    flat = index[:, None] * channels + torch.arange(channels)
     lowest = torch.full_like(zeros, -math.inf).flatten()
-    largest = lowest.scatter_reduce(0, places.flatten(), rows.flatten(), "amax").view(-1, channels)
+    largest = lowest.scatter_reduce(0, flat.flatten(), rows.flatten(), "amax").view(-1, channels)
     return torch.where(largest == -math.inf, 0.0, largest)
 
 
