@@ -1,5 +1,7 @@
 """detector.onnx: points to boxes in standard operators, against the detector, and its NMS against the kernel's twin."""
 
+import csv
+import re
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +23,7 @@ from tests.models import NARROW, lively, some_points
 onnx = pytest.importorskip("onnx", reason="onnx is not installed: pip install '.[test]'")
 onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed: pip install '.[test]'")
 
-from export import Difference, compare, edge_cases, run, session_of  # noqa: E402  of bench, which needs onnxruntime
+from export import Difference, compare, edge_cases, main, run, session_of  # noqa: E402  of bench, which needs onnxruntime
 
 CPU = torch.device("cpu")
 SMALL = [*NARROW, "head.score_threshold=0.02"]
@@ -203,6 +205,24 @@ def test_suppress(limit: int) -> None:
         want.append(own[kept[:limit]])
     assert torch.equal(suppress(boxes, labels, thresholds, limit), torch.cat(want))
     assert len(suppress(boxes[:0], labels[:0], thresholds, limit)) == 0
+
+
+def test_the_table(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """What docs/deploy.md has, on two scenes: equality, speed and where the time goes."""
+    monkeypatch.setattr("export.edge_cases", lambda street: {"no point": street[:0]})
+    main(["--data", str(scenes), "--repeat", "1", "--csv", str(tmp_path / "rows.csv")])
+    printed = capsys.readouterr().out
+    assert re.search(r"^2 frames +[1-9]\d* +0 +\d\.\de-\d\d +\d\.\de-\d\d$", printed, re.MULTILINE)
+    assert re.search(r"^no point +0 +0 ", printed, re.MULTILINE)
+    assert re.search(r"^detector\.onnx +\d+\.\d +\d+\.\d\dx$", printed, re.MULTILINE)
+    with (tmp_path / "rows.csv").open() as file:
+        rows = {row["what"]: row for row in csv.DictReader(file)}
+    shares = [float(row["share"]) for row in rows.values() if row["share"]]
+    assert len(shares) == 5
+    assert sum(shares) == pytest.approx(1, abs=0.01)
+    assert float(rows["hvnet.load()"]["ms"]) > 0
 
 
 @pytest.mark.parametrize("dtype", ["float32", torch.int32])
