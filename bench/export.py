@@ -34,8 +34,8 @@ SHIFT, SCORE = 1e-3, 1e-4
 STAGES = {"place": "ground, heights", "encoder": "encoder", "backbone": "backbone", "heads": "heads, decoding"}
 """The parts of `PointsToBoxes` by the scope of their nodes; what is outside of them is NMS."""
 
-COLUMNS = ("what", "boxes", "not_in_both", "largest_shift", "largest_of_score", "ms", "share")
-"""Of the rows that are written; those of equality, of speed and of shares leave out the others'."""
+COLUMNS = ("what", "boxes", "not_in_both", "largest_shift", "largest_score_difference", "ms", "share")
+"""Of the rows that are written. A row of equality, of speed or of a share leaves the other columns empty."""
 
 
 class Difference(NamedTuple):
@@ -70,7 +70,7 @@ def run(session: onnxruntime.InferenceSession, points: Tensor) -> Detections:
 
 
 def compare(found: Detections, want: Detections) -> Difference:
-    """Matches every box with the nearest one of its class and of about its score."""
+    """Matches every box with those of its class within SHIFT and SCORE of it."""
     shift = (found.boxes[:, None] - want.boxes[None]).abs()
     turn = (found.boxes[:, None, 6] - want.boxes[None, :, 6]) / 2
     shift = torch.maximum(shift[..., :6].amax(dim=2), 2 * turn.sin().abs())
@@ -86,11 +86,11 @@ def compare(found: Detections, want: Detections) -> Difference:
 
 
 def edge_cases(street: Tensor) -> dict[str, Tensor]:
-    """Clouds (N, 4) that are none, or that a street's (N, 4) becomes by accident."""
+    """Clouds (N, 4) with few points or none in range, and what may become of a street's (N, 4)."""
 
-    def changed(row: slice, column: slice | int, value: float) -> Tensor:
+    def changed(points: slice, column: slice | int, value: float) -> Tensor:
         cloud = street.clone()
-        cloud[row, column] = value
+        cloud[points, column] = value
         return cloud
 
     every = slice(None)
@@ -161,13 +161,15 @@ def main(argv: Sequence[str] | None = None) -> None:
         boxes, unmatched = sum(each.boxes for each in differences), sum(each.unmatched for each in differences)
         shift, score = max(each.shift for each in differences), max(each.score for each in differences)
         print(f"{what:<26}{boxes:>7}{unmatched:>13}{shift:>14.1e}{score:>12.1e}", flush=True)
-        rows.append(row(what=what, boxes=boxes, not_in_both=unmatched, largest_shift=shift, largest_of_score=score))
+        rows.append(
+            row(what=what, boxes=boxes, not_in_both=unmatched, largest_shift=shift, largest_score_difference=score)
+        )
 
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "detector.onnx"
         write_detector(detector, file)
         session = session_of(file, args.threads)
-        print(f"\n{'cloud':<26}{'boxes':>7}{'not in both':>13}{'largest shift':>14}{'of score':>12}")
+        print(f"\n{'cloud':<26}{'boxes':>7}{'not in both':>13}{'largest shift':>14}{'score':>12}")
         show(f"{len(clouds)} frames", [compare(run(session, each), detector(each)) for each in clouds.values()])
         for what, points in edge_cases(next(iter(clouds.values()))).items():
             show(what, [compare(run(session, points), detector(points))])

@@ -78,10 +78,12 @@ def test_a_study_is_written_and_goes_on(
     files = sorted((tmp_path / "rows").glob("*/result.json"))
     assert [json.loads(file.read_text())["steps"] for file in files] == [2] * 4
     # damaged: scored again from its checkpoint, which is whole; another row is left out. One file of either row
-    of_rows = {load_checkpoint(file.with_name("checkpoint.pt"))["config"]["encoder"]["point_limit"]: file
-               for file in files}  # fmt: skip
-    assert of_rows.keys() == {0, 8}
-    for file in of_rows.values():
+    results = {}
+    for file in files:
+        encoder = load_checkpoint(file.with_name("checkpoint.pt"))["config"]["encoder"]
+        results[encoder["point_limit"]] = file
+    assert results.keys() == {0, 8}
+    for file in results.values():
         whole = file.read_text()
         file.write_text("")
         main([*arguments(tmp_path, "--data", str(scenes), "--budget", "steps=2"), "--rows", "limit-8"])

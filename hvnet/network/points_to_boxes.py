@@ -142,7 +142,7 @@ class Candidates(nn.Module):
         # what is the same in every cell is written to the file once
         anchors = detector.anchors[label].view(*cells, self.per_cell, 7)
         self.x, self.y = anchors[:, 0, 0, :1].clone(), anchors[0, :, 0, 1:2].clone()
-        self.of_cell = anchors[0, 0, :, 2:].clone()
+        self.cell_anchors = anchors[0, 0, :, 2:].clone()
 
     def forward(self, level: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The pyramid level (1, C, N_L, N_W) to boxes (K, 7), scores (K,) and labels (K,), the best first.
@@ -160,7 +160,7 @@ class Candidates(nn.Module):
         cell = chosen // self.per_cell
         x = self.x.index_select(0, cell // self.columns)
         y = self.y.index_select(0, cell % self.columns)
-        anchors = torch.cat((x, y, self.of_cell.index_select(0, chosen % self.per_cell)), dim=1)
+        anchors = torch.cat((x, y, self.cell_anchors.index_select(0, chosen % self.per_cell)), dim=1)
         boxes = decode(values[:, :count], values[:, count : count + 2], direction, anchors)
         # the sum is finite if all of them are, which are bounded but for a NaN
         finite = (boxes.sum(dim=1).abs() < math.inf).nonzero().squeeze(1)
@@ -272,12 +272,12 @@ def suppress(boxes: Tensor, labels: Tensor, nms_iou: Tensor, limit: int) -> Tens
     each class that is left, and drops those that it overlaps.
     """
     number = torch.ones_like(labels).cumsum(0) - 1
-    of_class = labels[None] == torch.ones_like(nms_iou, dtype=torch.int64).cumsum(0)[:, None] - 1  # (C, M)
+    members = labels[None] == torch.ones_like(nms_iou, dtype=torch.int64).cumsum(0)[:, None] - 1  # (C, M)
     threshold = nms_iou.index_select(0, labels)
     left, kept = number >= 0, number < 0
     rounds = 0
     while rounds < limit and bool(left.any()):
-        first = (of_class & left).long().argmax(dim=1).index_select(0, labels)
+        first = (members & left).long().argmax(dim=1).index_select(0, labels)
         is_first = left & (number == first)
         kept = kept | is_first
         left = left & ~is_first & (iou_of_pairs(boxes.index_select(0, first), boxes) <= threshold)
