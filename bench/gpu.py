@@ -49,7 +49,7 @@ def bench(name: str, seconds: float, *arguments: str) -> Part:
 
 PYTEST = ("-m", "pytest", "-q", "-m", "cuda", "-p", "no:cacheprovider", "--continue-on-collection-errors")
 PARTS = (
-    Part("tests", (*PYTEST, "--junitxml=FILE", "tests"), 250),
+    Part("tests", (*PYTEST, "-n", "8", "--junitxml=FILE", "tests"), 250),  # their time is mostly the host's
     bench("voxel_encode", 90, "--no-compile"),
     bench("scatter", 60, "--order", "voxel"),
     bench("rotated", 50, "--boxes", "4096", "10000", "--matrix", "2048"),  # the plain-Python reference is left out

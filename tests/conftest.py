@@ -1,7 +1,9 @@
 """Fixtures for all tests: unwritten memory is seen, the real KITTI frames are found or skipped."""
 
+import contextlib
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,7 @@ from hvnet.config import Config, config_to_dict, load_config
 from hvnet.data.scenes.files import generate
 from hvnet.data.scenes.street import Options
 from hvnet.kernels import launch
+from hvnet.network import fused
 from hvnet.network.checkpoint import save_checkpoint
 from hvnet.network.model import HVNet
 from tests.helpers import SHARED
@@ -50,6 +53,14 @@ def threads(way: str, request: pytest.FixtureRequest) -> None:
     """Runs a test both ways of the CPU, and if it takes a device, every way."""
     if way == "cuda" and "device" not in request.fixturenames:
         pytest.skip("runs on the CPU")
+
+
+@pytest.fixture
+def plain_float32(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """No TF32, and convolutions by algorithms that repeat: a GPU's numbers are then near those of a CPU."""
+    monkeypatch.setattr(fused, "products_in_tf32", lambda device: contextlib.nullcontext())
+    with torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False):
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -5,13 +5,12 @@ the same, and arg-maxima of the same inputs; floats are close: a GPU contracts a
 another sine and cosine. Two runs on one GPU give the same bits. TF32 is left out of comparisons.
 """
 
-import contextlib
 import copy
 import dataclasses
 import gc
 import math
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from unittest import mock
 
@@ -48,23 +47,19 @@ from tests.encoders import SCALES, SMALL, cloud, restless, trained
 from tests.helpers import ROOT, random_boxes, same
 from tests.models import CONFIGS, NARROW, SHORT, lively, some_clouds, some_points
 
-pytestmark = [pytest.mark.cuda, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
+pytestmark = [
+    pytest.mark.cuda,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"),
+    pytest.mark.usefixtures("plain_float32"),
+]
 
 GPU, CPU = torch.device("cuda"), torch.device("cpu")
-# weights that are off by 3e-7 of themselves stay within both on a CPU; by 3e-6 one case does not
-LOSS = 1e-4  # relative
-GRADIENT = 1e-2  # of the norm: where two points tie but for rounding, the whole gradient goes to another one
+LOSS = 1e-4  # relative; weights that are off by 3e-7 of themselves stay within it on a CPU
+GRADIENT = 1e-2  # of the norm
+ROUNDING = 1e-7  # of a weight
 PRODUCTS_IN_TF32 = fused.products_in_tf32
 RAYS = 1_000_000  # enough to keep a GPU busy for milliseconds
 WAITS = 2  # that a step of training may make the host wait for the device
-
-
-@pytest.fixture(autouse=True)
-def plain_float32(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """No TF32, and convolutions by algorithms that repeat."""
-    monkeypatch.setattr(fused, "products_in_tf32", lambda device: contextlib.nullcontext())
-    with torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False):
-        yield
 
 
 @pytest.fixture
@@ -80,12 +75,15 @@ def street() -> Tensor:
     return torch.from_numpy(make_frame(0, 0, Options(azimuth=41))[1].points)
 
 
-def near_in_norm(got: Sequence[Tensor], want: Sequence[Tensor], tolerance: float) -> None:
-    """|got - want| <= tolerance * |want| for every tensor; one that is next to nothing is measured by the largest."""
+def near_in_norm(got: Sequence[Tensor], want: Sequence[Tensor], tolerance: float, *others: Sequence[Tensor]) -> None:
+    """|got - want| <= tolerance * |want| for every tensor; one that is next to nothing is measured by the largest.
+
+    `others` are as good as `want`: of every tensor the nearest counts.
+    """
     norms = [float(b.double().norm()) for b in want]
-    for a, b, norm in zip(got, want, norms, strict=True):
-        error = float((a.detach().cpu().double() - b.detach().double()).norm())
-        assert error <= tolerance * max(norm, 1e-3 * max(norms)), (tuple(b.shape), error, norm)
+    for k, (a, norm) in enumerate(zip(got, norms, strict=True)):
+        errors = [float((a.detach().cpu().double() - each[k].detach().double()).norm()) for each in (want, *others)]
+        assert min(errors) <= tolerance * max(norm, 1e-3 * max(norms)), (tuple(a.shape), errors, norm)
 
 
 def near(got: Sequence[Tensor], want: Sequence[Tensor], tolerance: float) -> None:
@@ -335,6 +333,19 @@ def losses_of(model: HVNet, device: torch.device) -> tuple[dict[str, Tensor], li
     return {name: term.detach() for name, term in terms.items()}, gradients, [b.float() for b in model.buffers()]
 
 
+def off_by_rounding(model: HVNet, seed: int) -> HVNet:
+    """The model with weights that differ in their last bit or two.
+
+    Where two points tie but for rounding, the whole gradient goes to the one or the other: an H100 gives weights of the
+    plain encoder a gradient that is 1.2 % off the CPU's, and so does the CPU for a third of these models.
+    """
+    model, generator = copy.deepcopy(model), torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for weight in model.parameters():
+            weight.mul_(1 + ROUNDING * torch.randn(weight.shape, generator=generator))
+    return model
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -357,7 +368,7 @@ def test_losses_and_gradients(changes: list[str]) -> None:
     for name, term in want[0].items():
         assert float(term) != 0, name
         torch.testing.assert_close(got[0][name].cpu(), term, rtol=LOSS, atol=0)
-    near_in_norm(got[1], want[1], GRADIENT)
+    near_in_norm(got[1], want[1], GRADIENT, *(losses_of(off_by_rounding(model, k), CPU)[1] for k in range(8)))
     near(got[2], want[2], 1e-3)
     assert same({name: float(term) for name, term in again[0].items()}, {n: float(t) for n, t in got[0].items()})
     equal(again[1], got[1])

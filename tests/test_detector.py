@@ -336,6 +336,7 @@ def test_a_frame_reads_nothing_from_the_device(changes: dict[str, str], height: 
 
 
 @pytest.mark.cuda
+@pytest.mark.usefixtures("plain_float32")
 def test_the_graph_gives_the_same_boxes(demo: Config, device: torch.device) -> None:
     if device.type != "cuda":
         pytest.skip("CUDA graphs need a GPU")
