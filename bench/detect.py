@@ -5,9 +5,10 @@ two copies: it takes less than their sum.
 
 Frames are read and judged (reflectance, ground), encoded, sent through the backbone, scored, decoded and suppressed,
 warm and synchronised, in turns with the plain model: float32, batch norms as they are, every anchor regressed. Before a
-time is taken, both are checked to give the same boxes. `compact` has the shipped weights. `hvnet`, the paper's
-configuration, has none: its scores mean nothing, so its threshold is 0, which sends as many candidates into decoding
-and NMS as there can be. With --all-round the detector also takes a whole scan: as it is, turned, in all directions.
+time is taken, both are checked to give the same boxes. `compact` and `standard` have the shipped weights. `hvnet`, the
+paper's configuration, has none: its scores mean nothing, so its threshold is 0, which sends as many candidates into
+decoding and NMS as there can be. With --all-round the detector also takes a whole scan: as it is, turned, in all
+directions.
 """
 
 import contextlib
@@ -40,11 +41,13 @@ CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 GROUND = -1.66
 """Height of the road under KITTI's clouds, as a detector finds it."""
 STAGES = ("read", "encode", "backbone", "heads", "decode", "NMS")
+SHIPPED = ("compact", "standard")
+"""The configs that come with weights."""
 
 
 def make_model(name: str) -> HVNet:
     """The shipped model, or an untrained one of a config."""
-    if name == "compact":
+    if name in SHIPPED:
         path = find_checkpoint(name)
         return model_from_checkpoint(load_checkpoint(path), str(path))
     torch.manual_seed(0)
@@ -64,7 +67,7 @@ def check(name: str, model: HVNet, points: Tensor, device: torch.device) -> None
     with plain_products, torch.backends.cudnn.flags(enabled=True, allow_tf32=False), torch.no_grad():
         levels = plain.backbone(plain.encoder(*inputs))
         agree(f"{name}, maps", detector.backbone(detector.encode(*inputs)), levels, 1e-3, 1e-4)
-        if name == "compact":
+        if name in SHIPPED:
             want, found = plain.detect(*inputs)[0], detector(points)
             agree(f"{name}, scores", [found.scores], [want.scores], 1e-3, 1e-4)
             agree(f"{name}, boxes", [found.boxes[:, :6]], [want.boxes[:, :6]], 1e-3, 1e-4)
@@ -141,7 +144,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     """The command."""
     arguments = parser("detect", __doc__, repeat=20)
     arguments.add_argument("--points", type=Path, help="a velodyne .bin (default: a generated scene)")
-    arguments.add_argument("--configs", nargs="+", default=["compact", "hvnet"], choices=["compact", "demo", "hvnet"])
+    known = [*SHIPPED, "demo", "hvnet"]
+    arguments.add_argument("--configs", nargs="+", default=["compact", "hvnet"], choices=known)
     arguments.add_argument("--batch", nargs="+", type=int, default=[1, 8], help="clouds at once (default: 1 8)")
     arguments.add_argument("--all-round", action="store_true", help="also a whole scan: turned, and all round")
     args = arguments.parse_args(argv)

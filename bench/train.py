@@ -107,7 +107,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     """The command."""
     arguments = parser("train", __doc__, repeat=10)
     arguments.add_argument("--data", type=Path, metavar="DIR", help="a KITTI root (default: scenes are generated)")
-    arguments.add_argument("--configs", nargs="+", default=["compact"], choices=["compact", "demo", "hvnet"])
+    known = ["compact", "demo", "hvnet", "standard"]
+    arguments.add_argument("--configs", nargs="+", default=["compact"], choices=known)
     arguments.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as of hvnet.train")
     args = arguments.parse_args(argv)
     bench = start("train", args)

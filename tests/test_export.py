@@ -242,7 +242,7 @@ def test_a_program_for_two_clouds_and_scales_that_do_not_nest(tmp_path: Path) ->
     assert_same_maps(program(points, sample), want)
 
 
-@pytest.mark.parametrize("name", ["compact", "demo", "hvnet"])
+@pytest.mark.parametrize("name", ["compact", "demo", "hvnet", "standard"])
 def test_the_layout_of_the_anchors(name: str) -> None:
     """meta.json is enough to make them."""
     config = load_config(ROOT / "configs" / f"{name}.yaml")

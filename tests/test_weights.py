@@ -23,19 +23,27 @@ from hvnet.weights.__main__ import RECIPES, halve, main
 from tests.helpers import ROOT
 from tests.models import CONFIGS, SHORT
 
+NAMES = sorted(path.stem for path in WEIGHTS.glob("*.pt"))
 
-def test_the_shipped_weights() -> None:
-    shipped = WEIGHTS / "compact.pt"
+
+def test_weights_and_recipes() -> None:
+    assert NAMES == sorted(path.stem for path in RECIPES.glob("*.yaml")) == ["compact", "standard"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_shipped_weights(name: str) -> None:
+    shipped = WEIGHTS / f"{name}.pt"
     assert shipped.stat().st_size <= 10e6
     content = load_checkpoint(shipped)
     assert content.keys() - {"made_by"} == {"config", "model", "sensor"}
     assert content["sensor"] == {"ground": pytest.approx(-1.66, abs=0.05), "reflectance_scale": 1.0}
-    recipe = load_config(RECIPES / "compact.yaml")
+    recipe = load_config(RECIPES / f"{name}.yaml")
+    assert recipe.train.seed == content["made_by"]["seed"]
     assert config_from_dict(content["config"], str(shipped)) == recipe
-    for name, value in content["model"].items():
-        wanted = torch.int64 if name.endswith("tracked") else torch.float32 if "running" in name else torch.float16
-        assert value.dtype == wanted, name
-        assert value.isfinite().all(), name
+    for key, value in content["model"].items():
+        wanted = torch.int64 if key.endswith("tracked") else torch.float32 if "running" in key else torch.float16
+        assert value.dtype == wanted, key
+        assert value.isfinite().all(), key
 
 
 def test_half_precision_changes_little(tmp_path: Path) -> None:
@@ -53,12 +61,13 @@ def test_half_precision_changes_little(tmp_path: Path) -> None:
         torch.testing.assert_close(b, a, rtol=1e-3, atol=1e-6, msg=name)
 
 
-def test_cars_are_found_in_real_frames(kitti_root: Path) -> None:
+@pytest.mark.parametrize("name", NAMES)
+def test_cars_are_found_in_real_frames(name: str, kitti_root: Path) -> None:
     """In frames that it was not trained on: most cars that a camera sees well and a scanner hits often."""
-    detector = hvnet.load(device="cpu")
+    detector = hvnet.load(name, device="cpu")
     seen = found = 0
-    for name in read_split(kitti_root, "val_first"):
-        frame = read_frame(kitti_root, name)
+    for frame_id in read_split(kitti_root, "val_first"):
+        frame = read_frame(kitti_root, frame_id)
         boxes, scores, labels = detector(frame.points)
         assert boxes.shape == (len(scores), 7)
         every = frame_labels(frame)
