@@ -1,4 +1,4 @@
-"""All that waits for a GPU, in ten minutes: the CUDA tests, the benchmarks, and whether the aims hold.
+"""The CUDA tests, the benchmarks, and whether the aims hold, in ten minutes.
 
 It writes a page and a JSON, named after the device, into bench/results/gpu/. A part that fails, runs out of time or
 lacks a package is reported as such, and the rest goes on. The exit code is 1 if a part failed or an aim is missed.
@@ -49,7 +49,7 @@ def bench(name: str, seconds: float, *arguments: str) -> Part:
 
 PYTEST = ("-m", "pytest", "-q", "-m", "cuda", "-p", "no:cacheprovider", "--continue-on-collection-errors")
 PARTS = (
-    Part("tests", (*PYTEST, "-n", "8", "--junitxml=FILE", "tests"), 250),  # their time is mostly the host's
+    Part("tests", (*PYTEST, "-n", "8", "--junitxml=FILE", "tests"), 250),  # one process would not end in time
     bench("voxel_encode", 90, "--no-compile"),
     bench("scatter", 60, "--order", "voxel"),
     bench("rotated", 50, "--boxes", "4096", "10000", "--matrix", "2048"),  # the plain-Python reference is left out

@@ -57,7 +57,7 @@ def threads(way: str, request: pytest.FixtureRequest) -> None:
 
 @pytest.fixture
 def plain_float32(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """No TF32, and convolutions by algorithms that repeat: a GPU's numbers are then near those of a CPU."""
+    """No TF32, and deterministic convolutions, so that a GPU's numbers are close to a CPU's."""
     monkeypatch.setattr(fused, "products_in_tf32", lambda device: contextlib.nullcontext())
     with torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False):
         yield

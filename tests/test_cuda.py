@@ -8,6 +8,7 @@ another sine and cosine. Two runs on one GPU give the same bits. TF32 is left ou
 import copy
 import dataclasses
 import gc
+import itertools
 import math
 import warnings
 from collections.abc import Callable, Sequence
@@ -75,15 +76,18 @@ def street() -> Tensor:
     return torch.from_numpy(make_frame(0, 0, Options(azimuth=41))[1].points)
 
 
-def near_in_norm(got: Sequence[Tensor], want: Sequence[Tensor], tolerance: float, *others: Sequence[Tensor]) -> None:
-    """|got - want| <= tolerance * |want| for every tensor; one that is next to nothing is measured by the largest.
-
-    `others` are as good as `want`: of every tensor the nearest counts.
-    """
+def errors_in_norm(got: Sequence[Tensor], want: Sequence[Tensor]) -> list[float]:
+    """|got - want| / |want| for every tensor; one that is next to nothing is measured by the largest."""
     norms = [float(b.double().norm()) for b in want]
-    for k, (a, norm) in enumerate(zip(got, norms, strict=True)):
-        errors = [float((a.detach().cpu().double() - each[k].detach().double()).norm()) for each in (want, *others)]
-        assert min(errors) <= tolerance * max(norm, 1e-3 * max(norms)), (tuple(a.shape), errors, norm)
+    return [
+        float((a.detach().cpu().double() - b.detach().double()).norm()) / max(norm, 1e-3 * max(norms))
+        for a, b, norm in zip(got, want, norms, strict=True)
+    ]
+
+
+def near_in_norm(got: Sequence[Tensor], want: Sequence[Tensor], tolerance: float) -> None:
+    errors = errors_in_norm(got, want)
+    assert max(errors) <= tolerance, [(tuple(b.shape), error) for b, error in zip(want, errors, strict=True)]
 
 
 def near(got: Sequence[Tensor], want: Sequence[Tensor], tolerance: float) -> None:
@@ -336,8 +340,8 @@ def losses_of(model: HVNet, device: torch.device) -> tuple[dict[str, Tensor], li
 def off_by_rounding(model: HVNet, seed: int) -> HVNet:
     """The model with weights that differ in their last bit or two.
 
-    Where two points tie but for rounding, the whole gradient goes to the one or the other: an H100 gives weights of the
-    plain encoder a gradient that is 1.2 % off the CPU's, and so does the CPU for a third of these models.
+    Where two points tie but for rounding, the whole gradient goes to the one or the other: the gradient of the plain
+    encoder on an H100 is 1.2 % off the CPU's, and so is the CPU's own for a third of these models.
     """
     model, generator = copy.deepcopy(model), torch.Generator().manual_seed(seed)
     with torch.no_grad():
@@ -368,7 +372,8 @@ def test_losses_and_gradients(changes: list[str]) -> None:
     for name, term in want[0].items():
         assert float(term) != 0, name
         torch.testing.assert_close(got[0][name].cpu(), term, rtol=LOSS, atol=0)
-    near_in_norm(got[1], want[1], GRADIENT, *(losses_of(off_by_rounding(model, k), CPU)[1] for k in range(8)))
+    neighbours = (losses_of(off_by_rounding(model, k), CPU)[1] for k in range(8))
+    assert any(max(errors_in_norm(got[1], each)) <= GRADIENT for each in itertools.chain([want[1]], neighbours))
     near(got[2], want[2], 1e-3)
     assert same({name: float(term) for name, term in again[0].items()}, {n: float(t) for n, t in got[0].items()})
     equal(again[1], got[1])

@@ -1,4 +1,4 @@
-"""The command for the day when a GPU is there, with made-up parts: what it reads, what it checks, what it writes."""
+"""The command for a GPU, with made-up parts: what it reads, what it checks, what it writes."""
 
 import importlib.util
 import json

@@ -134,7 +134,9 @@ def test_a_mirrored_cloud_gives_the_mirrored_boxes(street: Tensor) -> None:
 
 @both_ways
 def test_the_same_cars_are_found(frame: Frame, street: Tensor) -> None:
-    """Turned, at another height, all round and with others, too; each object once. Cars are those that are labelled.
+    """Turned, at another height, all round and with others, too; each object once.
+
+    What one view takes for a car, and is none, the others need not find: only cars that are labelled count.
 
     Found means an overlap of 0.5, as on the clouds of other sensors: turned by 10 degrees, a car that the
     sensor sees from beside, at 4 m, has another length.

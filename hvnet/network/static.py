@@ -3,8 +3,6 @@
 On CUDA one graph captures all of it. The clouds come to the device in one copy, the table leaves it in another.
 """
 
-import functools
-import threading
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -91,19 +89,6 @@ Run = Callable[[Tensor, Tensor, Tensor], Tensor]
 """From points (B, capacity, 4), counts (B,) int32 and samples (S capacity,) int64 to one row of numbers."""
 
 
-CAPTURES = threading.Lock()
-"""Held while the stream of captures is used: what another thread did there would be captured as well."""
-
-
-@functools.cache
-def capture_stream(device: torch.device) -> torch.cuda.Stream:
-    """The stream on which all graphs of a device are captured.
-
-    cuBLAS keeps a workspace, 32 MiB on an H100, for every stream that it has worked on.
-    """
-    return torch.cuda.Stream(device)
-
-
 class StaticFrame:
     """A frame of B clouds of at most `capacity` points: arrays of fixed size, and on CUDA the graph that fills them."""
 
@@ -124,16 +109,18 @@ class StaticFrame:
     def capture(self, run: Run) -> None:
         """Captures a run that reads nothing from the device as a graph."""
         device = self.buffer.device
-        with CAPTURES:
-            side = capture_stream(device)
-            side.wait_stream(torch.cuda.current_stream(device))
-            with torch.cuda.stream(side):
-                for _ in range(2):  # kernels are compiled and buffers made before the capture
-                    run(*self.split(self.buffer), self.sample)
-            torch.cuda.current_stream(device).wait_stream(side)
-            self.graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self.graph, stream=side, capture_error_mode="thread_local"):
-                self.output = run(*self.split(self.buffer), self.sample)
+        side = torch.cuda.Stream(device)
+        side.wait_stream(torch.cuda.current_stream(device))
+        with torch.cuda.stream(side):
+            for _ in range(2):  # kernels are compiled and buffers made before the capture
+                run(*self.split(self.buffer), self.sample)
+        torch.cuda.current_stream(device).wait_stream(side)
+        # cuBLAS keeps a workspace, 32 MiB on an H100, for every stream: that of the graph is to go with its memory
+        torch._C._cuda_clearCublasWorkspaces()
+        self.graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self.graph, stream=side, capture_error_mode="thread_local"):
+            self.output = run(*self.split(self.buffer), self.sample)
+        torch._C._cuda_clearCublasWorkspaces()
 
     def __call__(self, clouds: Sequence[Tensor], run: Run) -> Tensor:
         """What the run, or the graph that was captured of it, makes of clouds (N, 4) float32, on the host.
