@@ -33,7 +33,7 @@ from hvnet.data.scenes.files import make_frame
 from hvnet.data.scenes.street import Options
 from hvnet.exceptions import InputError
 from hvnet.network import fused
-from hvnet.network.checkpoint import find_checkpoint, load_checkpoint, model_from_checkpoint
+from hvnet.network.checkpoint import WEIGHTS, find_checkpoint, load_checkpoint, model_from_checkpoint
 from hvnet.network.detector import Detector
 from hvnet.network.model import HVNet
 
@@ -41,7 +41,7 @@ CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 GROUND = -1.66
 """Height of the road under KITTI's clouds, as a detector finds it."""
 STAGES = ("read", "encode", "backbone", "heads", "decode", "NMS")
-SHIPPED = ("compact", "standard")
+SHIPPED = sorted(path.stem for path in WEIGHTS.glob("*.pt"))
 """The configs that come with weights."""
 
 

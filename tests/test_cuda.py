@@ -548,8 +548,9 @@ def test_the_shipped_weights(mount: dict[str, object]) -> None:
     assert share_found(want, found, 0.5, 0.7) > 0.9
 
 
-def test_a_detector_repeats(street: Tensor) -> None:
-    detector = hvnet.load(device=GPU.type)
+@pytest.mark.parametrize("name", ["compact", "standard"])
+def test_a_detector_repeats(name: str, street: Tensor) -> None:
+    detector = hvnet.load(name, device=GPU.type)
     first = detector(street)
     assert len(first.boxes) > 3
     for _ in range(5):
