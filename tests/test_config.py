@@ -54,8 +54,9 @@ def test_shipped_configs_load_and_survive_the_round_trip(path: Path) -> None:
             for key, value in values.items():
                 if key != "classes":
                     assert plain[group][key] == value, f"{group}.{key}"
-    for entry, made in zip(given["head"]["classes"], plain["head"]["classes"], strict=True):
-        assert made == {"overlap": None} | entry
+    if "base" not in given:
+        for entry, made in zip(given["head"]["classes"], plain["head"]["classes"], strict=True):
+            assert made == {"overlap": None} | entry
 
 
 def test_the_demo_is_shipped() -> None:
