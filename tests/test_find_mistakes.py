@@ -10,7 +10,7 @@ import torch
 from hvnet.data.frame import Camera, Frame, Objects
 from hvnet.data.kitti import boxes_to_camera, read_frame
 from hvnet.data.labels import Labels
-from hvnet.evaluation.mistakes import FALSE_POSITIVE, MISS, Mistake, find_mistakes, worst
+from hvnet.evaluation.mistakes import FALSE_POSITIVE, MISS, Mistake, find_mistakes, judge, worst
 from hvnet.evaluation.rules import KITTI, Rule, rule_for
 from hvnet.network.model import Detections
 from tests import helpers
@@ -160,6 +160,28 @@ def test_any_class_by_its_rule(camera: Camera | None) -> None:
     ]
     wide = OWN | {"excavator": Rule(dict.fromkeys(("2d", "bev", "3d"), 0.6), {})}
     assert find_mistakes(frame, found, wide, 0.5) == []
+
+
+@pytest.mark.parametrize(
+    ("label", "box", "right", "wrong"),
+    [
+        (0, shifted(10, 0.71), True, False),
+        (0, shifted(10, 0.69), False, True),
+        (1, car(10), False, True),  # of another class
+        (0, car(30), False, False),  # a van
+        (1, car(30), False, True),
+        (0, car(50), False, False),  # in a region that nobody labelled
+        (0, car(-30), False, False),  # behind the camera
+        (0, car(20, 8), False, True),
+    ],
+)
+def test_right_wrong_or_not_scored(label: int, box: list[float], right: bool, wrong: bool) -> None:
+    region, _ = CAMERA.project_boxes(np.array([car(50)]))
+    frame = make_frame([("Car", car(10)), ("Van", car(30))], [], region.tolist())
+    verdicts = judge(frame, found_as((label, box)), KITTI)
+    assert (verdicts.right.tolist(), verdicts.wrong.tolist()) == ([right], [wrong])
+    nothing = judge(frame, found_as(), KITTI)
+    assert [len(part) for part in nothing] == [0, 0, 0]
 
 
 def test_what_is_outside_the_image_is_no_mistake() -> None:

@@ -32,6 +32,41 @@ class Mistake(NamedTuple):
     overlap: float  # best BEV IoU with a detection (for a miss) or a label (for a false positive) of the class
 
 
+class Verdicts(NamedTuple):
+    """What detections (M,) are worth in a labelled frame. One that is neither right nor wrong is not scored."""
+
+    right: Tensor  # (M,) bool
+    wrong: Tensor  # (M,) bool
+    overlaps: Tensor  # (M,) best BEV IoU with a label of the class
+
+
+def judge(frame: Frame, detections: Detections, rules: Mapping[str, Rule]) -> Verdicts:
+    """Which detections in a labelled frame are right: they reach the BEV IoU of their class's rule with a label of it.
+
+    `rules` are those of the classes, in the order that the detections' labels (M,) number.
+
+    The others are wrong, unless KITTI does not score them: where a Van is under a Car or a Person_sitting under a
+    Pedestrian, where more than half of the 2D box is in a DontCare region, or where none of it is in the image.
+
+    Raises ValueError for a frame without labels.
+    """
+    labels, unscored = frame_labels(frame), torch.zeros(len(detections.boxes), dtype=torch.bool)
+    if frame.camera is not None:
+        bbox, visible = frame.camera.project_boxes(detections.boxes.double().numpy())
+        regions = labels.bbox[labels.name == DONTCARE]
+        unscored = torch.from_numpy(~visible | (_largest_share(bbox, regions) > 0.5))
+    right, overlaps = torch.zeros_like(unscored), torch.zeros(len(unscored))
+    for label, (name, rule) in enumerate(rules.items()):
+        own, enough = detections.labels == label, rule.strict["bev"]
+        boxes = detections.boxes[own]
+        overlaps[own], _ = _largest(rotated_iou_bev(frame.boxes_of([name]), boxes), dim=0)
+        right[own] = overlaps[own] >= enough
+        if rule.neighbour is not None and rule.neighbour not in rules:
+            near, _ = _largest(rotated_iou_bev(frame.boxes_of([rule.neighbour]), boxes), dim=0)
+            unscored[own] |= near >= enough
+    return Verdicts(right, ~right & ~unscored, overlaps)
+
+
 def find_mistakes(frame: Frame, detections: Detections, rules: Mapping[str, Rule], min_score: float) -> list[Mistake]:
     """The mistakes of the detections in a labelled frame, misses first, class by class.
 
@@ -41,20 +76,14 @@ def find_mistakes(frame: Frame, detections: Detections, rules: Mapping[str, Rule
     IoU of the class's rule. A miss with an overlap above it was found, with a lower score. Where there is a camera, a
     box with nothing in the image is no miss, as `frame_labels` leaves it out.
 
-    A detection with score >= min_score is a false positive if it reaches that IoU with no label of its class, unless
-    KITTI does not score it: where a Van is under a Car or a Person_sitting under a Pedestrian, where more than half
-    of its 2D box is in a DontCare region, or where none of it is in the image.
+    A detection with score >= min_score is a false positive if it is wrong by `judge`.
     """
-    labels, objects = frame_labels(frame), frame.objects
+    verdicts, counts = judge(frame, detections, rules), detections.scores >= min_score
+    objects = frame.objects
     assert objects is not None
-    unscored = torch.zeros(len(detections.boxes), dtype=torch.bool)
     in_image = torch.ones(len(objects.boxes), dtype=torch.bool)
-    if frame.camera is not None:
-        if objects.labels is None:
-            in_image = torch.from_numpy(frame.camera.project_boxes(objects.boxes.double().numpy())[1])
-        bbox, visible = frame.camera.project_boxes(detections.boxes.double().numpy())
-        regions = labels.bbox[labels.name == DONTCARE]
-        unscored = torch.from_numpy(~visible | (_largest_share(bbox, regions) > 0.5))
+    if frame.camera is not None and objects.labels is None:
+        in_image = torch.from_numpy(frame.camera.project_boxes(objects.boxes.double().numpy())[1])
     found: dict[str, list[Mistake]] = {MISS: [], FALSE_POSITIVE: []}
 
     def note(kind: str, name: str, boxes: Tensor, scores: Tensor, overlaps: Tensor) -> None:
@@ -64,25 +93,19 @@ def find_mistakes(frame: Frame, detections: Detections, rules: Mapping[str, Rule
         found[kind] += [Mistake(frame.name, kind, name, *row) for row in rows]
 
     for label, (name, rule) in enumerate(rules.items()):
-        enough = rule.strict["bev"]
         own = detections.labels == label
-        boxes, scores, left_out = detections.boxes[own], detections.scores[own], unscored[own]
-        counts = scores >= min_score
+        scores = detections.scores[own]
         of_class = torch.tensor([each == name for each in objects.names], dtype=torch.bool)
         truth = objects.boxes[of_class]
-        iou = rotated_iou_bev(truth, boxes)  # (T, M_own)
+        iou = rotated_iou_bev(truth, detections.boxes[own])  # (T, M_own)
 
-        missed = (_largest(iou[:, counts], dim=1)[0] < enough) & in_image[of_class]
+        missed = (_largest(iou[:, counts[own]], dim=1)[0] < rule.strict["bev"]) & in_image[of_class]
         overlaps, best = _largest(iou, dim=1)
         score_of_best = torch.where(overlaps > 0, scores[best] if len(scores) else 0.0, 0.0)
         note(MISS, name, truth[missed], score_of_best[missed], overlaps[missed])
 
-        overlaps, _ = _largest(iou, dim=0)
-        if rule.neighbour is not None and rule.neighbour not in rules:
-            near, _ = _largest(rotated_iou_bev(frame.boxes_of([rule.neighbour]), boxes), dim=0)
-            left_out = left_out | (near >= enough)
-        wrong = counts & (overlaps < enough) & ~left_out
-        note(FALSE_POSITIVE, name, boxes[wrong], scores[wrong], overlaps[wrong])
+        wrong = own & counts & verdicts.wrong
+        note(FALSE_POSITIVE, name, detections.boxes[wrong], detections.scores[wrong], verdicts.overlaps[wrong])
     return found[MISS] + found[FALSE_POSITIVE]
 
 
