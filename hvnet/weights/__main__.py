@@ -1,7 +1,8 @@
 """Makes weights of the package anew: `python -m hvnet.weights --data KITTI_ROOT [--name NAME]`.
 
-It trains by the recipe NAME.yaml of this folder and writes the result in half precision. The root is the part of KITTI
-that docs/model_card.md names, with the objects of all 3712 training frames in gt_database.npz.
+It trains by the recipe NAME.yaml of this folder, calibrates the scores in the training frames as they are, and writes
+the result in half precision. The root is the part of KITTI that docs/model_card.md names, with the objects of all 3712
+training frames in gt_database.npz.
 """
 
 from collections.abc import Sequence
@@ -16,9 +17,11 @@ from hvnet.config import load_config
 from hvnet.data.gt_database import FILE_NAME
 from hvnet.exceptions import InputError
 from hvnet.network.checkpoint import DEFAULT, load_checkpoint, save_checkpoint
+from hvnet.network.detector import load
 from hvnet.network.devices import device_name, select_device
 from hvnet.network.model import HVNet
 from hvnet.training.batches import kitti_data
+from hvnet.training.calibration import calibrate
 from hvnet.training.folder import check_folder, check_room
 from hvnet.training.run import Run
 
@@ -39,12 +42,14 @@ def describe(run: Run) -> dict[str, str | int]:
     }
 
 
-def halve(checkpoint: Path, out: Path, made_by: dict[str, str | int]) -> None:
+def halve(checkpoint: Path, out: Path, made_by: dict[str, str | int], shifts: Sequence[float] = ()) -> None:
     """Writes config and weights of a checkpoint, the parameters in half precision, and what made them.
 
-    Running statistics stay in float32: the variances of the encoder's output overflow float16.
+    shifts: of `calibrate`. Running statistics stay in float32: the variances of the encoder's output overflow float16.
     """
     content = load_checkpoint(checkpoint)
+    for label, shift in enumerate(shifts):
+        content["model"][f"heads.{label}.score.bias"] += shift
     running = ("running_mean", "running_var", "num_batches_tracked")
     model = {
         name: value if name.endswith(running) else value.to(torch.float16) for name, value in content["model"].items()
@@ -57,9 +62,10 @@ def main(arguments: Sequence[str] | None) -> None:
     """The command."""
     parser = make_parser(
         "weights",
-        "Makes weights of the package anew: trains by a recipe and writes the result in half precision. The root is "
-        "the part of KITTI that docs/model_card.md names, with the objects of all 3712 training frames in "
-        "gt_database.npz. For two processes that train together, replace python with torchrun --nproc-per-node 2.",
+        "Makes weights of the package anew: trains by a recipe, calibrates the scores in the training frames as they "
+        "are, and writes the result in half precision. The root is the part of KITTI that docs/model_card.md names, "
+        "with the objects of all 3712 training frames in gt_database.npz. "
+        "For two processes that train together, replace python with torchrun --nproc-per-node 2.",
         ["--data /data/kitti", "--data /data/kitti --resume"],
     )
     names = sorted(path.stem for path in RECIPES.glob("*.yaml"))
@@ -86,7 +92,11 @@ def main(arguments: Sequence[str] | None) -> None:
     run = Run(config, kitti_data(options.data, config), folder, device, resume=options.resume)
     run.train()
     if ranks.rank() == 0:
-        halve(run.checkpoint, out, describe(run))
+        shifts = calibrate(load(run.checkpoint, options.device, dtype=torch.float32), run.data.train)
+        names = [entry.name for entry in config.head.classes]
+        moved = ", ".join(f"{name} {shift:+.4f}" for name, shift in zip(names, shifts, strict=True))
+        print(f"logits:     {moved}")
+        halve(run.checkpoint, out, describe(run), shifts)
         print(f"weights:    {out} ({out.stat().st_size / 1e6:.2f} MB)")
     ranks.stop()  # not after an error, as in hvnet.train
 

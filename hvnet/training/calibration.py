@@ -1,0 +1,81 @@
+"""Scores that keep their word: of the boxes with a score of 0.5, half are right.
+
+After training they are too high: frames with inserted objects hold many more than a street does, the focal loss weighs
+objects of rare classes more than the background, and a score is the mean of two, whether there is an object and how
+well its box fits.
+"""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
+
+from hvnet.data.frame import Frames
+from hvnet.evaluation.mistakes import judge
+from hvnet.evaluation.rules import Rule, config_rules
+from hvnet.evaluation.scoring import detect_frames
+from hvnet.network.detector import Detector
+
+ROUNDS = 10
+CLOSE = 0.01
+"""Logits. A score that is off by this at 0.5 is 0.4975 or 0.5025."""
+
+
+def calibrate(detector: Detector, frames: Frames) -> list[float]:
+    """Shifts the logits of a detector's classes until half of the boxes with a score of 0.5 are right in these frames.
+
+    A box is right if it has the loose BEV overlap of its class with a label (KITTI: 0.5 for cars, 0.25 for people).
+    What KITTI does not score counts for nothing. Boxes of a class keep their order, but for what the predicted IoU
+    changes.
+
+    Returns the shifts, by which the bias of every class's score has grown. A class without a right box, or without a
+    wrong one, is left as it is. Raises ValueError for a frame without labels.
+    """
+    rules = {name: rule._replace(strict=rule.loose) for name, rule in config_rules(detector.config).items()}
+    shifts, seen = [0.0] * len(rules), set[str]()
+    for _ in range(ROUNDS):
+        off = [boundary(scores, right) for scores, right in judged_scores(detector, frames, rules, seen)]
+        for label, (layers, logit) in enumerate(zip(detector.score_layers, off, strict=True)):
+            shifts[label] -= logit
+            bias = layers[0].bias
+            assert bias is not None
+            bias.data -= logit
+        if max(map(abs, off)) < CLOSE:
+            break
+    return shifts
+
+
+def judged_scores(
+    detector: Detector, frames: Frames, rules: Mapping[str, Rule], seen: set[str]
+) -> list[tuple[Tensor, Tensor]]:
+    """By class the scores (M,) of what a detector finds in labelled frames, and whether it is right (M,)."""
+    every: list[list[tuple[Tensor, Tensor]]] = [[] for _ in rules]
+    for detected in detect_frames(detector, frames, seen=seen):
+        verdicts = judge(detected.frame, detected.found, rules)
+        for label, parts in enumerate(every):
+            own = (detected.found.labels == label) & (verdicts.right | verdicts.wrong)
+            parts.append((detected.found.scores[own], verdicts.right[own]))
+    return [(torch.cat(scores), torch.cat(right)) for scores, right in (zip(*parts, strict=True) for parts in every)]
+
+
+def boundary(scores: Tensor, right: Tensor) -> float:
+    """The logit of the score (M,) at which a box is as likely right (M,) as wrong, by a logistic regression.
+
+    It lies among those of the scores. 0, which is the score 0.5, where all are right or all are wrong.
+    """
+    if right.all() or not right.any():
+        return 0.0
+    logits, target = scores.double().logit(eps=1e-6), right.double()
+    line = torch.zeros(2, dtype=torch.float64, requires_grad=True)  # slope and intercept
+    optimizer = torch.optim.LBFGS([line], max_iter=100, line_search_fn="strong_wolfe")
+
+    def loss() -> Tensor:
+        optimizer.zero_grad()
+        value = binary_cross_entropy_with_logits(line[0] * logits + line[1], target)
+        value.backward()
+        return value
+
+    optimizer.step(loss)
+    slope, intercept = line.detach()
+    return float((-intercept / slope).clamp(logits.min(), logits.max()))
