@@ -33,7 +33,13 @@ def test_the_boundary_of_scores_whose_meaning_is_known(score: float) -> None:
         ([0.2, 0.9], [True, True], 0.5, 0.5),
         ([0.2, 0.9], [False, False], 0.5, 0.5),
         ([0.2, 0.6, 0.7, 0.9], [False, False, True, True], 0.6, 0.7),  # nothing in between
-        ([0.2, 0.3, 0.7, 0.9], [True, True, False, False], 0.2, 0.9),  # upside down
+        ([0.2, 0.3, 0.7, 0.9], [True, True, False, False], 0.5, 0.5),  # upside down
+        ([0.31 + 0.005 * k for k in range(100)] + [0.32], [False] * 100 + [True], 0.5, 0.5),
+        ([0.31 + 0.005 * k for k in range(100)] + [0.85], [False] * 100 + [True], 0.8, 0.85),
+        ([0.5, 0.5], [True, False], 0.5, 0.5),
+        ([0.7, 0.7], [True, False], 0.5, 0.5),
+        ([0.3, 0.7, 0.3, 0.7], [True, True, False, False], 0.5, 0.5),
+        ([0.6] * 50, [True, False] * 25, 0.5, 0.5),
         ([0.6] * 9 + [0.7], [False] * 9 + [True], 0.6, 0.7),
         ([0.5, 0.5, 0.5, 0.5], [True, False, False, False], 0.5, 0.5),
         ([0.0, 0.4, 0.8, 1.0], [False, False, True, True], 0.4, 0.8),
@@ -46,7 +52,7 @@ def test_the_boundary_of_a_few(scores: list[float], right: list[bool], low: floa
 
 def shifted(shifts: Sequence[float]) -> Detector:
     """The default detector with other logits."""
-    detector = hvnet.load(device="cpu")
+    detector = hvnet.load(device="cpu", dtype=torch.float32)
     for layers, shift in zip(detector.score_layers, shifts, strict=True):
         layers[0].bias.data += shift
     return detector
@@ -54,7 +60,7 @@ def shifted(shifts: Sequence[float]) -> Detector:
 
 def biases(detector: Detector) -> list[float]:
     """Of every class, the mean over its anchors."""
-    return [layers[0].bias.mean().item() for layers in detector.score_layers]
+    return [layers[0].get_parameter("bias").mean().item() for layers in detector.score_layers]
 
 
 def test_scores_that_are_off_are_put_right(kitti_root: Path) -> None:
@@ -69,7 +75,7 @@ def test_scores_that_are_off_are_put_right(kitti_root: Path) -> None:
         before.append(biases(detector))
         moved = calibrate(detector, frames)
         assert biases(detector) == pytest.approx([a + b for a, b in zip(before[-1], moved, strict=True)], abs=1e-5)
-        for scores, right in judged_scores(detector, frames, loose_rules(detector), set()):
+        for scores, right in judged_scores(detector, frames, loose_rules(detector)):
             assert boundary(scores, right) == pytest.approx(0, abs=0.05)
         found.append(biases(detector))
     assert before[0] != pytest.approx(before[1], abs=1)
@@ -109,4 +115,10 @@ def test_frames_without_labels_are_refused(kitti_root: Path) -> None:
             return frame
 
     with pytest.raises(ValueError, match=f"frame {frame.name}: has no labels"):
-        calibrate(hvnet.load(device="cpu"), Unlabelled(kitti_root, frames.names))
+        calibrate(shifted([0, 0, 0]), Unlabelled(kitti_root, frames.names))
+
+
+def test_a_detector_in_half_precision_is_refused(kitti_root: Path) -> None:
+    frames = KittiFrames(kitti_root, read_split(kitti_root, "val")[:1])
+    with pytest.raises(ValueError, match=r"want a detector in float32, got torch\.bfloat16"):
+        calibrate(hvnet.load(device="cpu", dtype=torch.bfloat16), frames)

@@ -13,6 +13,7 @@ import hvnet
 from hvnet.config import load_config
 from hvnet.data.kitti import read_frame, read_split
 from hvnet.kernels import reference
+from hvnet.network.checkpoint import find_checkpoint, load_checkpoint, save_checkpoint
 from hvnet.network.detector import Detector
 from hvnet.network.export import DETECTOR_OPSET, write_detector
 from hvnet.network.model import Detections
@@ -31,8 +32,13 @@ EDGES = tuple(edge_cases(torch.zeros(9, 4)))
 
 
 @pytest.fixture(scope="module")
-def detector() -> Detector:
-    return hvnet.load(device="cpu", dtype=torch.float32)
+def detector(tmp_path_factory: pytest.TempPathFactory) -> Detector:
+    """The default weights, with more boxes than they report."""
+    content = load_checkpoint(find_checkpoint(None))
+    content["config"]["head"]["score_threshold"] = 0.2
+    path = tmp_path_factory.mktemp("weights") / "many.pt"
+    save_checkpoint(path, content)
+    return hvnet.load(path, device="cpu", dtype=torch.float32)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """The weights of the package: small, loadable, and made by a command."""
 
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -23,6 +24,7 @@ from hvnet.weights.__main__ import RECIPES, halve, main
 from tests.helpers import ROOT
 from tests.models import CONFIGS, SHORT
 
+MADE_BY = {"hvnet", "torch", "warp-lang", "processor", "processes", "threads", "seed", "frames", "shifts"}
 NAMES = sorted(path.stem for path in WEIGHTS.glob("*.pt"))
 
 
@@ -38,8 +40,7 @@ def test_the_shipped_weights(name: str) -> None:
     assert content.keys() - {"made_by"} == {"config", "model", "sensor"}
     assert content["sensor"] == {"ground": pytest.approx(-1.66, abs=0.05), "reflectance_scale": 1.0}
     recipe = load_config(RECIPES / f"{name}.yaml")
-    made_by = {"hvnet", "torch", "warp-lang", "processor", "processes", "threads", "seed", "frames"}
-    assert content["made_by"].keys() == made_by
+    assert content["made_by"].keys() == MADE_BY
     assert content["made_by"]["seed"] == recipe.train.seed
     assert config_from_dict(content["config"], str(shipped)) == recipe
     for key, value in content["model"].items():
@@ -53,11 +54,14 @@ def test_half_precision_changes_little(tmp_path: Path) -> None:
     config = load_config(RECIPES / "compact.yaml")
     model = HVNet(config)
     save_checkpoint(tmp_path / "whole.pt", {"config": config_to_dict(config), "model": model.state_dict(), "step": 3})
-    halve(tmp_path / "whole.pt", tmp_path / "half.pt", {"seed": 0})
+    halve(tmp_path / "whole.pt", tmp_path / "half.pt", {"seed": 0}, [-0.5, 0.25, 1.0])
     content = load_checkpoint(tmp_path / "half.pt")
     assert content.keys() == {"config", "model", "made_by"}
     half = HVNet(config)
     half.load_state_dict(content["model"])
+    with torch.no_grad():
+        for head, shift in zip(model.heads, [-0.5, 0.25, 1.0], strict=True):
+            head.score.bias += shift
     for (name, a), b in zip(model.state_dict().items(), half.state_dict().values(), strict=True):
         assert b.dtype == a.dtype
         torch.testing.assert_close(b, a, rtol=1e-3, atol=1e-6, msg=name)
@@ -129,7 +133,11 @@ def test_two_ranks_make_weights(copied: Path, tmp_path: Path, monkeypatch: pytes
     assert done.stdout.count("weights:    small.pt") == 1
     content = load_checkpoint(tmp_path / "small.pt")
     made_by = content["made_by"]
-    assert made_by.keys() == {"hvnet", "torch", "warp-lang", "processor", "processes", "threads", "seed", "frames"}
+    assert made_by.keys() == MADE_BY
+    assert f"logits:     {made_by['shifts']}\n" in done.stdout
+    assert re.fullmatch(
+        r"Car [+-]\d+\.\d{4}, Pedestrian [+-]\d+\.\d{4}, Cyclist [+-]\d+\.\d{4}", str(made_by["shifts"])
+    )
     assert {key: made_by[key] for key in ("hvnet", "processes", "threads", "seed", "frames")} == {
         "hvnet": hvnet.__version__, "processes": 2, "threads": 1, "seed": 3, "frames": 4
     }  # fmt: skip

@@ -33,7 +33,7 @@ class Mistake(NamedTuple):
 
 
 class Verdicts(NamedTuple):
-    """What detections (M,) are worth in a labelled frame. One that is neither right nor wrong is not scored."""
+    """Which detections (M,) in a labelled frame are right and which are wrong. The others are not scored."""
 
     right: Tensor  # (M,) bool
     wrong: Tensor  # (M,) bool

@@ -1,4 +1,4 @@
-"""Scores that keep their word: of the boxes with a score of 0.5, half are right.
+"""Calibrates scores: of the boxes with a score of 0.5, half are right.
 
 After training they are too high: frames with inserted objects hold many more than a street does, the focal loss weighs
 objects of rare classes more than the background, and a score is the mean of two, whether there is an object and how
@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from hvnet.data.frame import Frames
+from hvnet.data.frame import Frames, frame_at
 from hvnet.evaluation.mistakes import judge
 from hvnet.evaluation.rules import Rule, config_rules
-from hvnet.evaluation.scoring import detect_frames
+from hvnet.evaluation.scoring import detect_frame
 from hvnet.network.detector import Detector
 
 ROUNDS = 10
@@ -27,15 +27,19 @@ def calibrate(detector: Detector, frames: Frames) -> list[float]:
 
     A box is right if it has the loose BEV overlap of its class with a label (KITTI: 0.5 for cars, 0.25 for people).
     What KITTI does not score counts for nothing. Boxes of a class keep their order, but for what the predicted IoU
-    changes.
+    changes. A class is left as it is where nothing is known of it: see `boundary`. After ROUNDS passes through the
+    frames the shifts stay as they are.
 
-    Returns the shifts, by which the bias of every class's score has grown. A class without a right box, or without a
-    wrong one, is left as it is. Raises ValueError for a frame without labels.
+    Returns the shifts, by which the bias of every class's score has grown. Raises ValueError for a detector that is not
+    in float32, whose biases would be rounded, and for a frame without labels; InputError naming a frame that cannot be
+    read.
     """
+    if detector.dtype != torch.float32:
+        raise ValueError(f"want a detector in float32, got {detector.dtype}")
     rules = {name: rule._replace(strict=rule.loose) for name, rule in config_rules(detector.config).items()}
-    shifts, seen = [0.0] * len(rules), set[str]()
+    shifts = [0.0] * len(rules)
     for _ in range(ROUNDS):
-        off = [boundary(scores, right) for scores, right in judged_scores(detector, frames, rules, seen)]
+        off = [boundary(scores, right) for scores, right in judged_scores(detector, frames, rules)]
         for label, (layers, logit) in enumerate(zip(detector.score_layers, off, strict=True)):
             shifts[label] -= logit
             bias = layers[0].bias
@@ -46,23 +50,24 @@ def calibrate(detector: Detector, frames: Frames) -> list[float]:
     return shifts
 
 
-def judged_scores(
-    detector: Detector, frames: Frames, rules: Mapping[str, Rule], seen: set[str]
-) -> list[tuple[Tensor, Tensor]]:
+def judged_scores(detector: Detector, frames: Frames, rules: Mapping[str, Rule]) -> list[tuple[Tensor, Tensor]]:
     """By class the scores (M,) of what a detector finds in labelled frames, and whether it is right (M,)."""
     every: list[list[tuple[Tensor, Tensor]]] = [[] for _ in rules]
-    for detected in detect_frames(detector, frames, seen=seen):
-        verdicts = judge(detected.frame, detected.found, rules)
+    for k in range(len(frames)):
+        frame = frame_at(frames, k)
+        found = detect_frame(detector, frame)
+        verdicts = judge(frame, found, rules)
         for label, parts in enumerate(every):
-            own = (detected.found.labels == label) & (verdicts.right | verdicts.wrong)
-            parts.append((detected.found.scores[own], verdicts.right[own]))
+            own = (found.labels == label) & (verdicts.right | verdicts.wrong)
+            parts.append((found.scores[own], verdicts.right[own]))
     return [(torch.cat(scores), torch.cat(right)) for scores, right in (zip(*parts, strict=True) for parts in every)]
 
 
 def boundary(scores: Tensor, right: Tensor) -> float:
     """The logit of the score (M,) at which a box is as likely right (M,) as wrong, by a logistic regression.
 
-    It lies among those of the scores. 0, which is the score 0.5, where all are right or all are wrong.
+    It lies among the logits of the scores. 0, which is the score 0.5, where nothing is known: all are right, all are
+    wrong, or a higher score is not more often right.
     """
     if right.all() or not right.any():
         return 0.0
@@ -78,4 +83,4 @@ def boundary(scores: Tensor, right: Tensor) -> float:
 
     optimizer.step(loss)
     slope, intercept = line.detach()
-    return float((-intercept / slope).clamp(logits.min(), logits.max()))
+    return float((-intercept / slope).clamp(logits.min(), logits.max())) if slope > 0 else 0.0

@@ -23,7 +23,7 @@ from hvnet.network.model import HVNet
 from hvnet.training.batches import kitti_data
 from hvnet.training.calibration import calibrate
 from hvnet.training.folder import check_folder, check_room
-from hvnet.training.run import Run
+from hvnet.training.run import Run, deterministic
 
 RECIPES = Path(__file__).resolve().parent
 
@@ -42,10 +42,12 @@ def describe(run: Run) -> dict[str, str | int]:
     }
 
 
-def halve(checkpoint: Path, out: Path, made_by: dict[str, str | int], shifts: Sequence[float] = ()) -> None:
+def halve(checkpoint: Path, out: Path, made_by: dict[str, str | int], shifts: Sequence[float]) -> None:
     """Writes config and weights of a checkpoint, the parameters in half precision, and what made them.
 
-    shifts: of `calibrate`. Running statistics stay in float32: the variances of the encoder's output overflow float16.
+    shifts: of the logits of every class, which `calibrate` found.
+
+    Running statistics stay in float32: the variances of the encoder's output overflow float16.
     """
     content = load_checkpoint(checkpoint)
     for label, shift in enumerate(shifts):
@@ -92,12 +94,15 @@ def main(arguments: Sequence[str] | None) -> None:
     run = Run(config, kitti_data(options.data, config), folder, device, resume=options.resume)
     run.train()
     if ranks.rank() == 0:
-        shifts = calibrate(load(run.checkpoint, options.device, dtype=torch.float32), run.data.train)
-        names = [entry.name for entry in config.head.classes]
-        moved = ", ".join(f"{name} {shift:+.4f}" for name, shift in zip(names, shifts, strict=True))
+        print(f"calibrating in the {len(run.data.train)} training frames; if it is stopped, --resume begins it again")
+        detector = load(run.checkpoint, str(device), dtype=torch.float32)
+        with deterministic():
+            shifts = calibrate(detector, run.data.train)
+        moved = ", ".join(f"{name} {shift:+.4f}" for name, shift in zip(detector.classes, shifts, strict=True))
+        halve(run.checkpoint, out, describe(run) | {"shifts": moved}, shifts)
         print(f"logits:     {moved}")
-        halve(run.checkpoint, out, describe(run), shifts)
         print(f"weights:    {out} ({out.stat().st_size / 1e6:.2f} MB)")
+    ranks.broadcast(None)  # the others wait until it is written
     ranks.stop()  # not after an error, as in hvnet.train
 
 
