@@ -100,7 +100,7 @@ FRAME = (
     rule("context", "add_of_voxels"),
     rule("clear images", "images"),
     rule("fold batch norms", "folded"),
-    rule("scores", "score score_maps keys"),
+    rule("scores", "score keys"),
     rule("candidates", "candidates"),
     rule("NMS", "suppress"),
     rule("convolutions", names=CONVOLUTIONS),

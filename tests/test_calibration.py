@@ -53,14 +53,14 @@ def test_the_boundary_of_a_few(scores: list[float], right: list[bool], low: floa
 def shifted(shifts: Sequence[float]) -> Detector:
     """The default detector with other logits."""
     detector = hvnet.load(device="cpu", dtype=torch.float32)
-    for layers, shift in zip(detector.score_layers, shifts, strict=True):
-        layers[0].bias.data += shift
+    for label, shift in enumerate(shifts):
+        detector.score_maps.biases(label).add_(shift)
     return detector
 
 
 def biases(detector: Detector) -> list[float]:
     """Of every class, the mean over its anchors."""
-    return [layers[0].get_parameter("bias").mean().item() for layers in detector.score_layers]
+    return [detector.score_maps.biases(label).mean().item() for label in range(len(detector.classes))]
 
 
 def test_scores_that_are_off_are_put_right(kitti_root: Path) -> None:

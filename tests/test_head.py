@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from hvnet.config import Config
-from hvnet.network.head import Head, anchor_rows
+from hvnet.network.head import Head, ScoreMaps, anchor_rows
 
 
 def test_anchor_rows_have_the_order_of_the_anchors() -> None:
@@ -41,3 +41,29 @@ def test_chosen_anchors_have_the_values_and_gradients_of_the_maps(optional: bool
     ]
     for own, of_map in zip(*gradients, strict=True):
         torch.testing.assert_close(own, of_map, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("iou", [False, True])
+def test_classes_of_a_level_share_a_convolution(iou: bool, demo: Config) -> None:
+    """With other numbers of anchors and levels in another order, all have the maps of their own branches."""
+    torch.manual_seed(0)
+    config, entry = dataclasses.replace(demo.head, iou=iou), demo.head.classes[0]
+    sizes = (((3.9, 1.6, 1.5), (8.0, 2.5, 3.0)), ((0.8, 0.8, 1.7),), ((1.8, 0.8, 1.7),))
+    heads = [Head(dataclasses.replace(entry, anchor_sizes=own), 6, config) for own in sizes]
+    levels = [torch.randn(2, 6, 8, 4), torch.randn(2, 6, 4, 2), torch.randn(2, 6, 2, 1)]
+    at = (1, 0, 1)
+    state = torch.get_rng_state()
+    score_maps = ScoreMaps(heads, at)
+    assert torch.equal(torch.get_rng_state(), state)  # a run that is validated goes on as one that is not
+    assert len(score_maps.layers) == 2
+
+    def check() -> None:
+        for head, level, maps in zip(heads, at, score_maps(levels), strict=True):
+            branches = [head.score] if head.iou is None else [head.score, head.iou]
+            for branch, found in zip(branches, maps, strict=True):
+                torch.testing.assert_close(found, branch(levels[level]))
+
+    check()
+    heads[2].score.get_parameter("bias").data += 0.5
+    score_maps.biases(2).add_(0.5)
+    check()

@@ -39,7 +39,7 @@ from hvnet.network.backbone import ConvReLU
 from hvnet.network.checkpoint import find_checkpoint, load_checkpoint, model_from_checkpoint
 from hvnet.network.devices import select_device
 from hvnet.network.fused import inference, is_fused
-from hvnet.network.head import LOCATION_VALUES, Head, regress, scores_of, weight_of
+from hvnet.network.head import LOCATION_VALUES, Head, ScoreMaps, regress, scores_of, weight_of
 from hvnet.network.model import Detections, HVNet
 from hvnet.network.static import COLUMNS, BoxSteps, Rows, StaticFrame, capacity_of
 from hvnet.network.views import AUGMENTED, PLAIN, View, fuse, turned
@@ -133,11 +133,7 @@ class Detector:
         self.images_of = inference(model.encoder)
         self.backbone = fold_batch_norms(model.backbone).to(dtype=self.dtype)
         heads = [cast(Head, head) for head in model.heads]
-        # the score's branch of every class, and that of the IoU if there is one
-        self.score_layers = [
-            [copy.deepcopy(branch).to(dtype=self.dtype) for branch in (head.score, head.iou) if branch is not None]
-            for head in heads
-        ]
+        self.score_maps = ScoreMaps(heads, [entry.level for entry in self.entries]).to(dtype=self.dtype)
         self.regression_weights = [regression_weight(head) for head in heads]
         self.anchors = [model.anchors(label) for label in range(len(heads))]
         # for many threads
@@ -218,7 +214,7 @@ class Detector:
         point_range = self.config.encoder.point_range
         placed, bright = place_points(points, counts, shift, self.view_rows, point_range, self.reflectance)
         levels = self.backbone(self.encode(placed.view(-1, 4), sample, len(points) * len(self.views)))
-        table = self.steps.suppress(self.steps.candidates(levels, self.steps.keys(self.score_maps(levels))))
+        table = self.steps.suppress(self.steps.candidates(levels, self.keys(levels)))
         return torch.cat((table.flatten(), bright, shift, *reliefs))
 
     def relief(self, points: Tensor) -> Tensor:
@@ -316,23 +312,20 @@ class Detector:
         """Whether the encoder runs as `FusedEncoder` for batches of this size."""
         return is_fused(self.encoder, batch_size)
 
-    def score_maps(self, levels: list[Tensor]) -> list[list[Tensor]]:
-        """The logits (B, N_anc, N_L, N_W) of every class: of its score and, if it is predicted, of its IoU."""
-        return [
-            [layer(levels[entry.level]) for layer in layers]
-            for layers, entry in zip(self.score_layers, self.entries, strict=True)
-        ]
-
     def score(self, levels: list[Tensor]) -> tuple[list[Tensor], list[Tensor] | Tensor]:
         """The pyramid levels, and the scores (B, A) float32 of every class; by many threads their keys."""
         if many_threads(self.device):
-            return levels, self.steps.keys(self.score_maps(levels))
+            return levels, self.keys(levels)
         scores = []
         for maps in self.score_maps(levels):
             rows = [each.permute(0, 2, 3, 1) for each in maps]
             logits, *iou = [each.reshape(len(each), -1).float() for each in rows]
             scores.append(scores_of(logits, iou[0] if iou else None))
         return levels, scores
+
+    def keys(self, levels: list[Tensor]) -> Tensor:
+        """By many threads the keys of the anchors above the threshold, see `BoxSteps.keys`."""
+        return self.steps.keys(self.score_maps(levels))
 
     def candidates(self, levels: list[Tensor], scores: list[Tensor] | Tensor) -> list[list[Candidates]] | Rows:
         """For every sample and class the best anchors above the threshold, regressed and decoded."""
@@ -346,6 +339,8 @@ class Detector:
     def _candidates(self, label: int, b: int, levels: list[Tensor], scores: Tensor) -> Candidates:
         head, entry = self.config.head, self.entries[label]
         chosen = (scores > head.score_threshold).nonzero().squeeze(1)
+        if len(chosen) == 0:
+            return Candidates(scores.new_empty(0, 7), scores[chosen], chosen.bool())
         chosen = chosen[torch.sort(scores[chosen], descending=True, stable=True).indices[: head.candidates]]
         scores = scores[chosen]
         values = regress(

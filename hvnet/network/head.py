@@ -1,5 +1,6 @@
 """Detection head (Sec. 3.5): parallel 3x3 convolutions on a class's pyramid level."""
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -80,6 +81,52 @@ class Head(nn.Module):
             None if self.direction is None else anchor_rows(self.direction(level), 2),
             None if self.iou is None else anchor_rows(self.iou(level), 1).squeeze(-1),
         )
+
+
+class ScoreMaps(nn.Module):
+    """In inference, the branches of all classes for the score and the IoU, if there is one: one convolution a level.
+
+    A branch has so few channels that several together take hardly more time than one.
+    """
+
+    def __init__(self, heads: Sequence[Head], levels: Sequence[int]) -> None:
+        """levels: the pyramid level of every head."""
+        super().__init__()
+        self.levels = tuple(levels)
+        self.channels: list[list[slice]] = []
+        """Of every class, in its level's convolution: those of the score, those of the IoU."""
+        branches: dict[int, list[nn.Conv2d]] = {level: [] for level in levels}
+        for head, level in zip(heads, levels, strict=True):
+            self.channels.append([])
+            for branch in (head.score, head.iou):
+                if branch is not None:
+                    first = sum(each.out_channels for each in branches[level])
+                    self.channels[-1].append(slice(first, first + branch.out_channels))
+                    branches[level].append(branch)
+        self.layers = nn.ModuleDict({str(level): joined(own) for level, own in branches.items()})
+
+    def forward(self, levels: Sequence[Tensor]) -> list[list[Tensor]]:
+        """Pyramid levels (B, C, N_L, N_W) / 2^k to the logits (B, N_anc, N_L, N_W) of every class: score, IoU."""
+        maps = {level: layer(levels[int(level)]) for level, layer in self.layers.items()}
+        return [
+            [maps[str(level)][:, part] for part in parts]
+            for level, parts in zip(self.levels, self.channels, strict=True)
+        ]
+
+    def biases(self, label: int) -> Tensor:
+        """Those (N_anc,) of a class's score: a view, which writes to them."""
+        bias = self.layers[str(self.levels[label])].get_parameter("bias")
+        return bias.data[self.channels[label][0]]
+
+
+def joined(branches: Sequence[nn.Conv2d]) -> nn.Conv2d:
+    """Branches of heads as one convolution, channel after channel."""
+    layer = copy.deepcopy(branches[0])  # a new one would draw its weights, and so change what training draws next
+    layer.out_channels = sum(branch.out_channels for branch in branches)
+    weight = torch.cat([branch.weight.detach() for branch in branches])
+    layer.weight = nn.Parameter(weight.contiguous(memory_format=torch.channels_last))
+    layer.bias = nn.Parameter(torch.cat([branch.get_parameter("bias").detach() for branch in branches]))
+    return layer
 
 
 def weight_of(branches: Sequence[nn.Conv2d], anchors: int) -> Tensor:

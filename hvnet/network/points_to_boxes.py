@@ -134,7 +134,6 @@ class Candidates(nn.Module):
         super().__init__()
         config, self.label = detector.config, label
         self.head, self.entry = config.head, config.head.classes[label]
-        self.layers = nn.ModuleList(detector.score_layers[label])
         self.weight = detector.regression_weights[label]
         self.per_cell = anchors_per_cell(self.entry)
         cells = [length // level_step(config, self.entry) for length in projection_grids(config.encoder)[0].shape]
@@ -144,12 +143,13 @@ class Candidates(nn.Module):
         self.x, self.y = anchors[:, 0, 0, :1].clone(), anchors[0, :, 0, 1:2].clone()
         self.cell_anchors = anchors[0, 0, :, 2:].clone()
 
-    def forward(self, level: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The pyramid level (1, C, N_L, N_W) to boxes (K, 7), scores (K,) and labels (K,), the best first.
+    def forward(self, level: Tensor, maps: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """The pyramid level (1, C, N_L, N_W) and the maps of the score and the IoU, if there is one, to boxes (K, 7),
+        scores (K,) and labels (K,), the best first.
 
         As `Detector.candidates`; boxes that are not finite are left out.
         """
-        head, rows = self.head, [layer(level).permute(0, 2, 3, 1).flatten() for layer in self.layers]
+        head, rows = self.head, [each.permute(0, 2, 3, 1).flatten() for each in maps]
         scores = scores_of(rows[0], rows[1] if len(rows) > 1 else None)
         chosen = (scores > head.score_threshold).nonzero().squeeze(1)
         scores, best = best_of(scores.index_select(0, chosen), head.candidates)
@@ -183,6 +183,7 @@ class PointsToBoxes(nn.Module):
         self.nms, self.detections = nms, detector.config.head.detections
         self.nms_iou = torch.tensor([entry.nms_iou for entry in entries])
         self.place, self.encoder, self.backbone = Place(detector), Encoder(detector.encoder), detector.backbone
+        self.score_maps = detector.score_maps
         self.heads = nn.ModuleList([Candidates(detector, label) for label in range(len(entries))])
         self.levels = [entry.level for entry in entries]
 
@@ -190,7 +191,8 @@ class PointsToBoxes(nn.Module):
         """Points (N, 4): x, y, z in metres and reflectance in [0, 1]."""
         points, shift, relief = self.place(points)
         levels = self.backbone(self.encoder(points))
-        parts = [head(levels[level]) for head, level in zip(self.heads, self.levels, strict=True)]
+        maps = self.score_maps(levels)
+        parts = [head(levels[level], own) for head, level, own in zip(self.heads, self.levels, maps, strict=True)]
         boxes, scores, labels = (torch.cat(column) for column in zip(*parts, strict=True))
         if self.nms:
             kept = suppress(boxes, labels, self.nms_iou, self.detections)

@@ -40,11 +40,9 @@ def calibrate(detector: Detector, frames: Frames) -> list[float]:
     shifts = [0.0] * len(rules)
     for _ in range(ROUNDS):
         off = [boundary(scores, right) for scores, right in judged_scores(detector, frames, rules)]
-        for label, (layers, logit) in enumerate(zip(detector.score_layers, off, strict=True)):
+        for label, logit in enumerate(off):
             shifts[label] -= logit
-            bias = layers[0].bias
-            assert bias is not None
-            bias.data -= logit
+            detector.score_maps.biases(label).sub_(logit)
         if max(map(abs, off)) < CLOSE:
             break
     return shifts
