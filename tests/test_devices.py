@@ -1,6 +1,9 @@
 """Which device a name means, and what is said where torch sees a GPU and Warp does not."""
 
+import platform
 import re
+import subprocess
+import sys
 import warnings
 
 import pytest
@@ -12,6 +15,7 @@ from hvnet.exceptions import InputError
 from hvnet.kernels.launch import cuda_problem, launch
 from hvnet.kernels.rotated import rotated_iou_bev
 from hvnet.network.devices import device_name, select_device
+from tests.helpers import ROOT
 
 
 def test_names() -> None:
@@ -49,3 +53,30 @@ def test_a_gpu_that_warp_does_not_see(monkeypatch: pytest.MonkeyPatch, capsys: p
         warnings.simplefilter("error")
         assert select_device("cpu") == torch.device("cpu")
         assert rotated_iou_bev(torch.ones(1, 7), torch.ones(1, 7)).item() == 1
+
+
+FAULTS = """
+import resource
+import torch, hvnet
+
+torch.set_num_threads(1)
+detector = hvnet.load(device="cpu")
+points = torch.rand(20000, 4, generator=torch.Generator().manual_seed(0)) * torch.tensor([60.0, 50.0, 2.0, 1.0])
+points -= torch.tensor([0.0, 25.0, 1.8, 0.0])
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(5):
+        detector(points)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+faults()
+print(faults())
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another allocator: what it keeps is not known")
+def test_a_detector_asks_for_memory_once() -> None:
+    """Warm calls touch no new pages: without `keep_memory` five of them touch some 25,000."""
+    done = subprocess.run([sys.executable, "-c", FAULTS], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 1000

@@ -37,7 +37,7 @@ from hvnet.kernels.rotated import nms_order, rotated_nms
 from hvnet.network.anchors import anchors_per_cell, decode
 from hvnet.network.backbone import ConvReLU
 from hvnet.network.checkpoint import find_checkpoint, load_checkpoint, model_from_checkpoint
-from hvnet.network.devices import select_device
+from hvnet.network.devices import keep_memory, select_device
 from hvnet.network.fused import inference, is_fused
 from hvnet.network.head import LOCATION_VALUES, Head, ScoreMaps, regress, scores_of, weight_of
 from hvnet.network.model import Detections, HVNet
@@ -86,7 +86,8 @@ class Candidates(NamedTuple):
 class Detector:
     """A trained model on a device: `detector(points)` gives the boxes of one cloud.
 
-    The model is copied; training it further does not change the detector.
+    The model is copied; training it further does not change the detector. On a CPU the process keeps memory that it
+    frees (`keep_memory`).
 
     ground: height of the road in the clouds that the model was trained with, in metres; None: not known.
     reflectance: whether these had any.
@@ -124,6 +125,8 @@ class Detector:
         self.views_of_turn = AUGMENTED if tta else PLAIN
         self.views = [view._replace(angle=turn + view.angle) for turn in self.turns for view in self.views_of_turn]
         self.device = device
+        if device.type == "cpu":
+            keep_memory()
         self.dtype = dtype or fastest_dtype(device)
         self.config = model.config
         self.entries = model.config.head.classes

@@ -1,5 +1,6 @@
 """The device to run on, and what it is called."""
 
+import ctypes
 import platform
 import sys
 from pathlib import Path
@@ -8,6 +9,11 @@ import torch
 
 from hvnet.exceptions import InputError
 from hvnet.kernels.launch import cuda_problem
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+"""Of glibc's mallopt: how much free memory at the heap's end, and how large a block, goes back to the system."""
+KEPT, KEPT_BLOCK = 2**28, 2**25
+"""Bytes for both. The largest block of one cloud is 20 MB with `standard`, and one above 32 MiB may be refused."""
 
 
 def select_device(name: str) -> torch.device:
@@ -41,3 +47,15 @@ def device_name(device: torch.device) -> str:
     lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()
+
+
+def keep_memory() -> None:
+    """Lets this process keep memory that it frees, up to 256 MiB, where the allocator is glibc's.
+
+    By itself that gives large blocks back, and the system clears page after page again for the next cloud, which needs
+    as many.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        mallopt(M_TRIM_THRESHOLD, KEPT)
+        mallopt(M_MMAP_THRESHOLD, KEPT_BLOCK)
