@@ -100,7 +100,7 @@ FRAME = (
     rule("context", "add_of_voxels"),
     rule("clear images", "images"),
     rule("fold batch norms", "folded"),
-    rule("scores", "score keys"),
+    rule("scores", "score"),
     rule("candidates", "candidates"),
     rule("NMS", "suppress"),
     rule("convolutions", names=CONVOLUTIONS),

@@ -54,13 +54,13 @@ def shifted(shifts: Sequence[float]) -> Detector:
     """The default detector with other logits."""
     detector = hvnet.load(device="cpu", dtype=torch.float32)
     for label, shift in enumerate(shifts):
-        detector.score_maps.biases(label).add_(shift)
+        detector.score_maps.score_bias(label).add_(shift)
     return detector
 
 
 def biases(detector: Detector) -> list[float]:
     """Of every class, the mean over its anchors."""
-    return [detector.score_maps.biases(label).mean().item() for label in range(len(detector.classes))]
+    return [detector.score_maps.score_bias(label).mean().item() for label in range(len(detector.classes))]
 
 
 def test_scores_that_are_off_are_put_right(kitti_root: Path) -> None:

@@ -51,19 +51,15 @@ def test_classes_of_a_level_share_a_convolution(iou: bool, demo: Config) -> None
     sizes = (((3.9, 1.6, 1.5), (8.0, 2.5, 3.0)), ((0.8, 0.8, 1.7),), ((1.8, 0.8, 1.7),))
     heads = [Head(dataclasses.replace(entry, anchor_sizes=own), 6, config) for own in sizes]
     levels = [torch.randn(2, 6, 8, 4), torch.randn(2, 6, 4, 2), torch.randn(2, 6, 2, 1)]
-    at = (1, 0, 1)
+    level_of_class = (1, 0, 1)
     state = torch.get_rng_state()
-    score_maps = ScoreMaps(heads, at)
+    score_maps = ScoreMaps(heads, level_of_class)
     assert torch.equal(torch.get_rng_state(), state)  # a run that is validated goes on as one that is not
     assert len(score_maps.layers) == 2
-
-    def check() -> None:
-        for head, level, maps in zip(heads, at, score_maps(levels), strict=True):
+    for shift in (0.0, 0.5):
+        heads[2].score.get_parameter("bias").data += shift
+        score_maps.score_bias(2).add_(shift)
+        for head, level, maps in zip(heads, level_of_class, score_maps(levels), strict=True):
             branches = [head.score] if head.iou is None else [head.score, head.iou]
             for branch, found in zip(branches, maps, strict=True):
                 torch.testing.assert_close(found, branch(levels[level]))
-
-    check()
-    heads[2].score.get_parameter("bias").data += 0.5
-    score_maps.biases(2).add_(0.5)
-    check()

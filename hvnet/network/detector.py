@@ -86,8 +86,8 @@ class Candidates(NamedTuple):
 class Detector:
     """A trained model on a device: `detector(points)` gives the boxes of one cloud.
 
-    The model is copied; training it further does not change the detector. On a CPU the process keeps memory that it
-    frees (`keep_memory`).
+    The model is copied; training it further does not change the detector. On a CPU the process keeps memory
+    that it frees, see `keep_memory`.
 
     ground: height of the road in the clouds that the model was trained with, in metres; None: not known.
     reflectance: whether these had any.
@@ -216,8 +216,8 @@ class Detector:
             reliefs = [relief.flatten()]
         point_range = self.config.encoder.point_range
         placed, bright = place_points(points, counts, shift, self.view_rows, point_range, self.reflectance)
-        levels = self.backbone(self.encode(placed.view(-1, 4), sample, len(points) * len(self.views)))
-        table = self.steps.suppress(self.steps.candidates(levels, self.keys(levels)))
+        levels, keys = self.maps(placed.view(-1, 4), sample, len(points) * len(self.views))
+        table = self.steps.suppress(self.steps.candidates(levels, cast(Tensor, keys)))
         return torch.cat((table.flatten(), bright, shift, *reliefs))
 
     def relief(self, points: Tensor) -> Tensor:
@@ -318,17 +318,13 @@ class Detector:
     def score(self, levels: list[Tensor]) -> tuple[list[Tensor], list[Tensor] | Tensor]:
         """The pyramid levels, and the scores (B, A) float32 of every class; by many threads their keys."""
         if many_threads(self.device):
-            return levels, self.keys(levels)
+            return levels, self.steps.keys(self.score_maps(levels))
         scores = []
         for maps in self.score_maps(levels):
             rows = [each.permute(0, 2, 3, 1) for each in maps]
             logits, *iou = [each.reshape(len(each), -1).float() for each in rows]
             scores.append(scores_of(logits, iou[0] if iou else None))
         return levels, scores
-
-    def keys(self, levels: list[Tensor]) -> Tensor:
-        """By many threads the keys of the anchors above the threshold, see `BoxSteps.keys`."""
-        return self.steps.keys(self.score_maps(levels))
 
     def candidates(self, levels: list[Tensor], scores: list[Tensor] | Tensor) -> list[list[Candidates]] | Rows:
         """For every sample and class the best anchors above the threshold, regressed and decoded."""
@@ -343,7 +339,7 @@ class Detector:
         head, entry = self.config.head, self.entries[label]
         chosen = (scores > head.score_threshold).nonzero().squeeze(1)
         if len(chosen) == 0:
-            return Candidates(scores.new_empty(0, 7), scores[chosen], chosen.bool())
+            return Candidates(scores.new_empty(0, 7), scores.new_empty(0), torch.empty(0, dtype=torch.bool))
         chosen = chosen[torch.sort(scores[chosen], descending=True, stable=True).indices[: head.candidates]]
         scores = scores[chosen]
         values = regress(

@@ -1,6 +1,7 @@
-"""The device to run on, and what it is called."""
+"""The device to run on, what it is called, and what a CPU's allocator keeps."""
 
 import ctypes
+import os
 import platform
 import sys
 from pathlib import Path
@@ -11,9 +12,11 @@ from hvnet.exceptions import InputError
 from hvnet.kernels.launch import cuda_problem
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
-"""Of glibc's mallopt: how much free memory at the heap's end, and how large a block, goes back to the system."""
+"""Of glibc's mallopt: more free memory at the heap's end, and a larger block, go back to the system."""
 KEPT, KEPT_BLOCK = 2**28, 2**25
-"""Bytes for both. The largest block of one cloud is 20 MB with `standard`, and one above 32 MiB may be refused."""
+"""Bytes for both. The largest block of one cloud is 20 MB with `standard`; glibc may refuse more than 32 MiB."""
+MALLOC_SETTINGS = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES")
+"""Environment variables by which a user decides."""
 
 
 def select_device(name: str) -> torch.device:
@@ -50,12 +53,13 @@ def device_name(device: torch.device) -> str:
 
 
 def keep_memory() -> None:
-    """Lets this process keep memory that it frees, up to 256 MiB, where the allocator is glibc's.
+    """Lets this process keep freed blocks of up to 32 MiB, where the allocator is glibc's and the user has not set it.
 
-    By itself that gives large blocks back, and the system clears page after page again for the next cloud, which needs
-    as many.
+    By default glibc returns large blocks to the system, which has to clear their pages again for the next cloud.
     """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    if mallopt is not None:
+    if sys.platform != "linux" or any(name in os.environ for name in MALLOC_SETTINGS):
+        return
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    # either of them ends what glibc would adapt by itself: both or none
+    if mallopt is not None and mallopt(M_MMAP_THRESHOLD, KEPT_BLOCK):
         mallopt(M_TRIM_THRESHOLD, KEPT)
-        mallopt(M_MMAP_THRESHOLD, KEPT_BLOCK)

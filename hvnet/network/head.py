@@ -84,7 +84,7 @@ class Head(nn.Module):
 
 
 class ScoreMaps(nn.Module):
-    """In inference, the branches of all classes for the score and the IoU, if there is one: one convolution a level.
+    """The score and IoU branches of all classes, for inference: one convolution a pyramid level.
 
     A branch has so few channels that several together take hardly more time than one.
     """
@@ -92,35 +92,35 @@ class ScoreMaps(nn.Module):
     def __init__(self, heads: Sequence[Head], levels: Sequence[int]) -> None:
         """levels: the pyramid level of every head."""
         super().__init__()
-        self.levels = tuple(levels)
+        self.level_of_class = [str(level) for level in levels]  # keys of `layers`
         self.channels: list[list[slice]] = []
         """Of every class, in its level's convolution: those of the score, those of the IoU."""
-        branches: dict[int, list[nn.Conv2d]] = {level: [] for level in levels}
-        for head, level in zip(heads, levels, strict=True):
+        branches: dict[str, list[nn.Conv2d]] = {level: [] for level in self.level_of_class}
+        for head, level in zip(heads, self.level_of_class, strict=True):
             self.channels.append([])
             for branch in (head.score, head.iou):
                 if branch is not None:
                     first = sum(each.out_channels for each in branches[level])
                     self.channels[-1].append(slice(first, first + branch.out_channels))
                     branches[level].append(branch)
-        self.layers = nn.ModuleDict({str(level): joined(own) for level, own in branches.items()})
+        self.layers = nn.ModuleDict({level: join_convolutions(own) for level, own in branches.items()})
 
     def forward(self, levels: Sequence[Tensor]) -> list[list[Tensor]]:
         """Pyramid levels (B, C, N_L, N_W) / 2^k to the logits (B, N_anc, N_L, N_W) of every class: score, IoU."""
         maps = {level: layer(levels[int(level)]) for level, layer in self.layers.items()}
         return [
-            [maps[str(level)][:, part] for part in parts]
-            for level, parts in zip(self.levels, self.channels, strict=True)
+            [maps[level][:, part] for part in parts]
+            for level, parts in zip(self.level_of_class, self.channels, strict=True)
         ]
 
-    def biases(self, label: int) -> Tensor:
-        """Those (N_anc,) of a class's score: a view, which writes to them."""
-        bias = self.layers[str(self.levels[label])].get_parameter("bias")
+    def score_bias(self, label: int) -> Tensor:
+        """The bias (N_anc,) of a class's score branch: a view, so that writing to it changes the layer."""
+        bias = self.layers[self.level_of_class[label]].get_parameter("bias")
         return bias.data[self.channels[label][0]]
 
 
-def joined(branches: Sequence[nn.Conv2d]) -> nn.Conv2d:
-    """Branches of heads as one convolution, channel after channel."""
+def join_convolutions(branches: Sequence[nn.Conv2d]) -> nn.Conv2d:
+    """Branches of heads as one convolution, whose outputs are theirs, one after the other."""
     layer = copy.deepcopy(branches[0])  # a new one would draw its weights, and so change what training draws next
     layer.out_channels = sum(branch.out_channels for branch in branches)
     weight = torch.cat([branch.weight.detach() for branch in branches])

@@ -42,7 +42,7 @@ def calibrate(detector: Detector, frames: Frames) -> list[float]:
         off = [boundary(scores, right) for scores, right in judged_scores(detector, frames, rules)]
         for label, logit in enumerate(off):
             shifts[label] -= logit
-            detector.score_maps.biases(label).sub_(logit)
+            detector.score_maps.score_bias(label).sub_(logit)
         if max(map(abs, off)) < CLOSE:
             break
     return shifts
